@@ -1,0 +1,1 @@
+"""What every process shares: geometry, frames, Gaussians, splatting, metrics. No process, no disk format."""

@@ -1,0 +1,1 @@
+"""Which earlier sections a frame sees."""

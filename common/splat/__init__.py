@@ -1,0 +1,1 @@
+"""Rasteriser engines behind one protocol."""

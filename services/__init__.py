@@ -1,0 +1,1 @@
+"""One folder per process: a pure core and a thin loop."""

@@ -1,0 +1,1 @@
+"""Grows and optimises the active section."""

@@ -1,0 +1,1 @@
+"""The sensor: sources of RGB-D frames."""

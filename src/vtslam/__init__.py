@@ -1,0 +1,1 @@
+"""RGB-D SLAM by splatting view-tied 3D Gaussians."""
