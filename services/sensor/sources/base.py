@@ -1,0 +1,82 @@
+"""The protocol of all sources, their errors, and the URI that names one."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+from urllib.parse import parse_qsl, urlencode
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.geometry.camera import Camera
+
+
+class SourceError(ValueError):
+    """A source cannot be read: the text names the file, what was expected and what was found."""
+
+
+class Source(Protocol):
+    """Frames in order, seekable, the same bytes at each reading."""
+
+    @property
+    def uri(self) -> str:
+        """The text that opens it again, from any working directory."""
+        ...
+
+    @property
+    def family(self) -> str:
+        """The settings family that fits it (design section 6)."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of all frames."""
+        ...
+
+    @property
+    def depth_scale_m(self) -> float:
+        """Metres per unit of the uint16 depth."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def frame(self, index: int) -> Frame:
+        """Frame ``index``; raises SourceError if its files are missing, cut or inconsistent."""
+        ...
+
+    def ground_truth(self) -> npt.NDArray[np.float64] | None:
+        """True poses ``T_world_camera`` float64 [F,4,4], or None where the recording has none."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceUri:
+    """``scheme:path?key=value&key=value``, as typed by users."""
+
+    scheme: str
+    path: str
+    options: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str) -> "SourceUri":
+        """Split a source URI.
+
+        Raises:
+            SourceError: There is no scheme, or an option is not ``key=value``.
+        """
+        scheme, colon, rest = text.partition(":")
+        if not colon or not scheme:
+            raise SourceError(f"a source reads scheme:path, as in replica:DIR or sim:room; got {text!r}")
+        path, _, query = rest.partition("?")
+        try:
+            options = dict(parse_qsl(query, strict_parsing=True)) if query else {}
+        except ValueError as error:
+            raise SourceError(f"options of a source read ?key=value&key=value; got {query!r}") from error
+        return cls(scheme=scheme, path=path, options=options)
+
+    def __str__(self) -> str:
+        """The text that :meth:`parse` reads back."""
+        query = f"?{urlencode(self.options, safe=':/,')}" if self.options else ""
+        return f"{self.scheme}:{self.path}{query}"

@@ -1,0 +1,175 @@
+"""Reading colour and depth image files strictly, and the source made of one file pair per frame.
+
+OpenCV decodes a cut file as far as it goes and returns it, so each file's structure is checked before it is decoded.
+"""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.geometry.camera import Camera
+from vtslam.services.sensor.sources.base import SourceError
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_FRAMES_PER_SECOND = 30  # of recordings without time stamps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FramePaths:
+    """The two image files of one frame."""
+
+    color: Path
+    depth: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FilePairSource:
+    """A recording of one colour and one depth file per frame (the `Source` protocol).
+
+    Attributes:
+        uri, family, camera, depth_scale_m: As in `Source`.
+        files: The image files of all frames, in order.
+        poses: ``T_world_camera`` float64 [F,4,4], or None.
+        no_depth: A raw depth value that means "no depth" besides 0, or None.
+    """
+
+    uri: str
+    family: str
+    camera: Camera
+    depth_scale_m: float
+    files: Sequence[FramePaths]
+    poses: npt.NDArray[np.float64] | None
+    no_depth: int | None = None
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.files)
+
+    def frame(self, index: int) -> Frame:
+        """Frame ``index``, 0 to F-1; capture times are those of 30 frames a second from 0.
+
+        Raises:
+            SourceError: A file is missing, damaged, of another kind, or not of the intrinsics' size.
+            IndexError: There is no such frame.
+        """
+        if not 0 <= index < len(self.files):
+            raise IndexError(f"{self.uri}: frame {index} of {len(self.files)}")
+        paths = self.files[index]
+        rgb, depth = read_color(paths.color), read_depth(paths.depth)
+        self._check_sizes(paths, rgb.shape[:2], depth.shape)
+        if self.no_depth is not None:
+            depth[depth == self.no_depth] = 0
+        return Frame(
+            frame_id=index,
+            capture_time_ns=(index * 1_000_000_000) // _FRAMES_PER_SECOND,
+            rgb=rgb,
+            depth=depth,
+            depth_scale_m=self.depth_scale_m,
+            camera=self.camera,
+        )
+
+    def ground_truth(self) -> npt.NDArray[np.float64] | None:
+        """True poses ``T_world_camera`` float64 [F,4,4] (a copy), or None."""
+        return None if self.poses is None else self.poses.copy()
+
+    def _check_sizes(self, paths: FramePaths, color_hw: tuple[int, ...], depth_hw: tuple[int, ...]) -> None:
+        if color_hw != depth_hw:
+            raise SourceError(f"{paths.depth}: expected the size of its colour image {_wxh(color_hw)}, "
+                              f"found {_wxh(depth_hw)}")  # fmt: skip
+        if color_hw != (self.camera.height, self.camera.width):
+            raise SourceError(
+                f"{paths.color}: expected the size of the intrinsics {self.camera.width}x{self.camera.height}, "
+                f"found {_wxh(color_hw)}"
+            )
+
+
+def read_color(path: Path) -> npt.NDArray[np.uint8]:
+    """An 8-bit PNG or JPEG file as uint8 [H,W,3], red first; rotation tags are not applied.
+
+    Raises:
+        SourceError: The file is missing, cut, damaged, or of another kind.
+    """
+    data = _read_bytes(path, "colour image")
+    if data.startswith(_PNG_SIGNATURE):
+        _check_png(path, data)
+        if data[24] != 8:
+            raise SourceError(f"{path}: expected an 8-bit colour image, found {data[24]} bits per channel")
+    elif data.startswith(_JPEG_START):
+        if not data.rstrip(b"\0").endswith(_JPEG_END):
+            raise SourceError(f"{path}: expected a whole JPEG file, found it cut after {len(data)} bytes (no end mark)")
+    else:
+        raise SourceError(f"{path}: expected a PNG or JPEG file, found {_head(data)}")
+    bgr = _decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+
+
+def read_depth(path: Path) -> npt.NDArray[np.uint16]:
+    """A 16-bit gray PNG file as uint16 [H,W].
+
+    Raises:
+        SourceError: The file is missing, cut, damaged, or of another kind.
+    """
+    data = _read_bytes(path, "depth image")
+    if not data.startswith(_PNG_SIGNATURE):
+        raise SourceError(f"{path}: expected a 16-bit PNG file, found {_head(data)}")
+    _check_png(path, data)
+    bits, color_type = data[24], data[25]
+    if bits != 16 or color_type != 0:
+        kind = "gray" if color_type == 0 else f"PNG colour type {color_type}"
+        raise SourceError(f"{path}: expected 16-bit gray depth, found {bits}-bit {kind}")
+    return np.asarray(_decode(path, data, cv2.IMREAD_UNCHANGED), np.uint16)
+
+
+def _read_bytes(path: Path, what: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise SourceError(f"{path}: expected a {what}, found no such file") from None
+    except OSError as error:
+        raise SourceError(f"{path}: expected a readable {what}, found {error.strerror}") from error
+
+
+def _check_png(path: Path, data: bytes) -> None:
+    """Walk the chunks (length, type, payload, CRC) from IHDR to IEND."""
+    at, kind = len(_PNG_SIGNATURE), b""
+    while kind != b"IEND":
+        if at + 12 > len(data):
+            raise SourceError(f"{path}: expected a whole PNG file, found it cut after {len(data)} bytes")
+        (length,) = struct.unpack_from(">I", data, at)
+        kind, end = data[at + 4 : at + 8], at + 12 + length
+        if end > len(data):
+            raise SourceError(
+                f"{path}: expected a whole PNG file, found it cut after {len(data)} bytes of at least {end + 12}"
+            )
+        (crc,) = struct.unpack_from(">I", data, end - 4)
+        if crc != zlib.crc32(memoryview(data)[at + 4 : end - 4]):
+            raise SourceError(f"{path}: expected a sound PNG file, found a wrong checksum in chunk {kind!r}")
+        if at == len(_PNG_SIGNATURE) and (kind != b"IHDR" or length != 13):
+            raise SourceError(f"{path}: expected a PNG header, found chunk {kind!r} of {length} bytes")
+        at = end
+
+
+def _decode(path: Path, data: bytes, flags: int) -> npt.NDArray[np.generic]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise SourceError(f"{path}: expected a decodable image, found {error}") from error
+    if image is None:
+        raise SourceError(f"{path}: expected a decodable image, found damaged data ({len(data)} bytes)")
+    return np.asarray(image)
+
+
+def _head(data: bytes) -> str:
+    return f"a file that begins with {data[:8].hex(' ')}" if data else "an empty file"
+
+
+def _wxh(height_width: tuple[int, ...]) -> str:
+    return f"{height_width[1]}x{height_width[0]}"

@@ -1,0 +1,171 @@
+"""Opens the source a URI names, at a size and over a range of frames."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.geometry.camera import Camera
+from vtslam.services.sensor.sources.base import Source, SourceError, SourceUri
+
+Size = tuple[int, int]
+
+
+def _open_replica(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.replica import open_replica
+
+    return open_replica(uri)
+
+
+def _open_seven_scenes(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.seven_scenes import open_seven_scenes
+
+    return open_seven_scenes(uri)
+
+
+def _open_sim(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.sim_room import SimRoom
+
+    return SimRoom.open(uri, size=size)
+
+
+# Scheme -> (form for messages, opener). Openers import their reader when called: a run needs one of them.
+_READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
+    "replica": ("replica:DIR", _open_replica),
+    "7scenes": ("7scenes:DIR", _open_seven_scenes),
+    "sim": ("sim:room", _open_sim),
+}
+
+
+def open_source(
+    uri: str,
+    *,
+    size: Size | None = None,
+    frames: tuple[int, int] | None = None,
+    overrides: Mapping[str, str] | None = None,
+) -> Source:
+    """Open a source.
+
+    Every source also takes the options ``size=WxH`` and ``range=A:B`` (frames A to B-1, then counted from 0; B may be
+    left out). The arguments replace them. They are part of the ``uri`` of the result, which therefore opens the very
+    same frames again, also when the same arguments are given once more.
+
+    Args:
+        uri: ``scheme:path?key=value``.
+        size: Width and height in pixels to resize to (a simulator renders at that size); None keeps the source's.
+        frames: First frame and the one after the last; None takes all.
+        overrides: Options added to the URI's, replacing those of the same name.
+
+    Raises:
+        SourceError: Unknown scheme or option, a range outside the source, or the reader's own refusals.
+    """
+    parsed = SourceUri.parse(uri)
+    options = {**parsed.options, **(overrides or {})}
+    size_text, range_text = options.pop("size", None), options.pop("range", None)
+    if size is None and size_text is not None:
+        size = _parsed_size(size_text)
+    if parsed.scheme not in _READERS:
+        known = ", ".join(form for form, _ in _READERS.values())
+        raise SourceError(f"expected a source among {known}; found {uri!r}")
+    source = _READERS[parsed.scheme][1](replace(parsed, options=options), size)
+    if size is not None:
+        source = _resized(source, size)
+    if frames is None and range_text is not None:
+        frames = _parsed_range(range_text, len(source))
+    return source if frames is None else _sub_range(source, frames)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Resized:
+    """A source whose frames are scaled by `Frame.resized`."""
+
+    inner: Source
+    uri: str
+    camera: Camera
+
+    @property
+    def family(self) -> str:
+        return self.inner.family
+
+    @property
+    def depth_scale_m(self) -> float:
+        return self.inner.depth_scale_m
+
+    def __len__(self) -> int:
+        return len(self.inner)
+
+    def frame(self, index: int) -> Frame:
+        return self.inner.frame(index).resized(self.camera.width, self.camera.height)
+
+    def ground_truth(self) -> npt.NDArray[np.float64] | None:
+        return self.inner.ground_truth()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _SubRange:
+    """Frames ``first`` to ``end - 1`` of a source; ids count from 0, capture times stay the recording's."""
+
+    inner: Source
+    uri: str
+    first: int
+    end: int
+
+    @property
+    def family(self) -> str:
+        return self.inner.family
+
+    @property
+    def camera(self) -> Camera:
+        return self.inner.camera
+
+    @property
+    def depth_scale_m(self) -> float:
+        return self.inner.depth_scale_m
+
+    def __len__(self) -> int:
+        return self.end - self.first
+
+    def frame(self, index: int) -> Frame:
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.uri}: frame {index} of {len(self)}")
+        return replace(self.inner.frame(self.first + index), frame_id=index)
+
+    def ground_truth(self) -> npt.NDArray[np.float64] | None:
+        poses = self.inner.ground_truth()
+        return None if poses is None else poses[self.first : self.end]
+
+
+def _resized(source: Source, size: Size) -> Source:
+    width, height = size
+    if width < 1 or height < 1:
+        raise SourceError(f"size: expected a positive width and height, found {width}x{height}")
+    uri = _with_option(source.uri, "size", f"{width}x{height}")
+    return _Resized(inner=source, uri=uri, camera=source.camera.resized(width, height))
+
+
+def _sub_range(source: Source, frames: tuple[int, int]) -> Source:
+    first, end = frames
+    if not 0 <= first < end <= len(source):
+        raise SourceError(f"{source.uri}: expected frames A:B with 0 <= A < B <= {len(source)}, found {first}:{end}")
+    return _SubRange(inner=source, uri=_with_option(source.uri, "range", f"{first}:{end}"), first=first, end=end)
+
+
+def _with_option(uri: str, key: str, value: str) -> str:
+    parsed = SourceUri.parse(uri)
+    return str(replace(parsed, options={**parsed.options, key: value}))
+
+
+def _parsed_size(text: str) -> Size:
+    width, cross, height = text.partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal()):
+        raise SourceError(f"option size: expected WxH, as in 320x240; found {text!r}")
+    return int(width), int(height)
+
+
+def _parsed_range(text: str, num_frames: int) -> tuple[int, int]:
+    first, colon, end = text.partition(":")
+    if not (colon and first.isdecimal() and (end.isdecimal() or not end)):
+        raise SourceError(f"option range: expected A:B, as in 0:120; found {text!r}")
+    return int(first), int(end) if end else num_frames
