@@ -1,0 +1,334 @@
+"""Named arrays and a header in one checked file: the `.vts` container, version 1 (docs/format-section.md)."""
+
+import hashlib
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from stat import S_ISREG
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.storage import plain_msgpack
+from vtslam.storage.atomic import replace_file
+from vtslam.storage.errors import (
+    BadMagic,
+    ChecksumMismatch,
+    MalformedSection,
+    TruncatedFile,
+    UnreadableFile,
+    UnsupportedVersion,
+)
+from vtslam.storage.section_layout import (
+    CRC,
+    DTYPES,
+    END_MARK,
+    FOOTER,
+    FORMAT_VERSION,
+    INDEX_REFERENCE,
+    MAGIC,
+    MAX_COLUMNS,
+    MAX_DIMENSIONS,
+    NAME,
+    PRELUDE,
+    Entry,
+    aligned,
+    check_crc,
+    check_equal,
+    check_places,
+    parse_header,
+    parse_index,
+)
+from vtslam.storage.section_record import SectionRecord
+
+AnyArray = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Layout:
+    """All of an open file but its columns, checked against the file's size."""
+
+    prelude: bytes
+    header_bytes: bytes
+    header: dict[str, Any]
+    entries: tuple[Entry, ...]
+    index_bytes: bytes
+    index_offset: int
+    index_reference: bytes
+    sha256: bytes
+
+
+def write_columns(path: Path, header: Mapping[str, Any], columns: Mapping[str, AnyArray]) -> None:
+    """Write ``header`` and ``columns`` to ``path``, replacing it as a whole, then read back from disk and compare.
+
+    Args:
+        path: The file; its folder must exist.
+        header: Plain values (see :mod:`vtslam.storage.plain_msgpack`), at most 65536 bytes packed.
+        columns: Arrays of integer or float32/float64 type, at most 8 dimensions; names as in the format's section 1.
+
+    Raises:
+        MalformedSection: The format cannot hold this header or these columns.
+        WriteFailed: The operating system refused.
+        StorageError: What came back from the disk is not what was written.
+    """
+    try:
+        pieces = list(_encoded(dict(header), columns))
+    except ValueError as error:
+        raise MalformedSection(f"{path}: cannot be written: {error}") from error
+    replace_file(path, pieces)
+    written = FOOTER.unpack(pieces[-1])[1]
+    found = verify_file(path)
+    if found != written:
+        raise ChecksumMismatch.differing(path, "SHA-256 read back", expected=written.hex(), found=found.hex())
+
+
+def _encoded(header: dict[str, Any], columns: Mapping[str, AnyArray]) -> Iterator[bytes | memoryview]:
+    """The file's bytes, piece by piece; the last piece is the footer."""
+    header_bytes = plain_msgpack.pack(header)
+    arrays = {name: _stored(name, columns[name]) for name in sorted(columns)}
+    if len(arrays) > MAX_COLUMNS:
+        raise ValueError(f"there are {len(arrays)} columns, at most {MAX_COLUMNS} fit")
+    entries, end = [], PRELUDE.size + len(header_bytes)
+    for name, array in arrays.items():
+        offset = aligned(end)
+        end = offset + array.nbytes
+        entries.append(
+            Entry(
+                name=name,
+                dtype_name=array.dtype.name,
+                shape=array.shape,
+                offset=offset,
+                length=array.nbytes,
+                crc32=zlib.crc32(_bytes_of(array)),
+            )
+        )
+    index_bytes = plain_msgpack.pack([entry.as_list() for entry in entries])
+    index_offset = aligned(end)
+    file_size = index_offset + len(index_bytes) + FOOTER.size
+
+    digest = hashlib.sha256()
+    for piece in _body(header_bytes, file_size, entries, arrays, index_offset, index_bytes):
+        digest.update(piece)
+        yield piece
+    checked = INDEX_REFERENCE.pack(index_offset, len(index_bytes), zlib.crc32(index_bytes))
+    digest.update(checked)
+    yield FOOTER.pack(checked, digest.digest(), zlib.crc32(checked + digest.digest()), END_MARK)
+
+
+def _body(
+    header_bytes: bytes,
+    file_size: int,
+    entries: Sequence[Entry],
+    arrays: Mapping[str, AnyArray],
+    index_offset: int,
+    index_bytes: bytes,
+) -> Iterator[bytes | memoryview]:
+    """Everything before the footer."""
+    fields = (MAGIC, FORMAT_VERSION, len(header_bytes), file_size, zlib.crc32(header_bytes))
+    prelude = PRELUDE.pack(*fields, 0)[: -CRC.size]
+    yield prelude + CRC.pack(zlib.crc32(prelude))
+    yield header_bytes
+    end = PRELUDE.size + len(header_bytes)
+    for entry in entries:
+        yield bytes(entry.offset - end)
+        yield _bytes_of(arrays[entry.name])
+        end = entry.offset + entry.length
+    yield bytes(index_offset - end)
+    yield index_bytes
+
+
+def _stored(name: str, array: AnyArray) -> AnyArray:
+    """``array`` little-endian and in C order (copied only if it is not), if the format can hold it."""
+    if not NAME.fullmatch(name):
+        raise ValueError(f"a column's name must match {NAME.pattern}, got {name!r:.80}")
+    dtype = DTYPES.get(array.dtype.name)
+    if dtype is None or array.ndim > MAX_DIMENSIONS:
+        raise ValueError(
+            f"column {name!r} must be one of {', '.join(DTYPES)} with at most {MAX_DIMENSIONS} dimensions, "
+            f"got {array.dtype} {array.shape}"
+        )
+    return np.asarray(array, dtype=dtype, order="C")
+
+
+def _bytes_of(array: AnyArray) -> memoryview:
+    return array.reshape(-1).view(np.uint8).data
+
+
+def read_columns(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+    """The header and the columns of a file, each column's bytes checked.
+
+    Args:
+        path: The file.
+        names: Columns to read; None for all, which also checks the whole file's SHA-256.
+
+    Returns:
+        The header, and new writable arrays by name (all, sorted by name, or as in ``names``).
+
+    Raises:
+        StorageError: One of the kinds in the format's section 4.
+    """
+    with _open(path) as file:
+        layout = _read_layout(file, path)
+        if names is None:
+            return layout.header, dict(_read_whole(file, path, layout))
+        by_name = {entry.name: entry for entry in layout.entries}
+        for name in names:
+            if name not in by_name:
+                raise MalformedSection.differing(path, "columns", expected=repr(name), found=sorted(by_name))
+        return layout.header, {name: _read_column(file, path, by_name[name]) for name in names}
+
+
+def verify_file(path: Path) -> bytes:
+    """Check every byte of a file, read from disk and not from memory where the system allows; its SHA-256.
+
+    Raises:
+        StorageError: One of the kinds in the format's section 4.
+    """
+    with _open(path) as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        layout = _read_layout(file, path)
+        for _ in _read_whole(file, path, layout):
+            pass
+    return layout.sha256
+
+
+def _open(path: Path) -> FileIO:
+    """The file, unbuffered; never waits, as opening a pipe would."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError as error:
+        raise UnreadableFile(f"{path}: cannot open: {error.strerror}") from error
+    if not S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise UnreadableFile.differing(path, "kind", expected="a regular file", found="a folder or device")
+    return FileIO(descriptor, "rb")
+
+
+def _read_layout(file: FileIO, path: Path) -> _Layout:
+    """Everything but the columns, in the order of checks of the format's section 4."""
+    size = os.fstat(file.fileno()).st_size
+    prelude, header_length, header_crc = _read_prelude(file, path, size)
+    footer = _read(file, path, size - FOOTER.size, FOOTER.size)
+    reference, sha256, footer_crc, end_mark = FOOTER.unpack(footer)
+    check_crc(path, "footer", footer_crc, reference + sha256)
+    check_equal(path, "end mark", END_MARK, end_mark, MalformedSection)
+    index_offset, index_length, index_crc = INDEX_REFERENCE.unpack(reference)
+    header_end = PRELUDE.size + header_length
+    if index_length > plain_msgpack.MAX_BYTES or index_offset + index_length + FOOTER.size != size:
+        raise MalformedSection.differing(
+            path,
+            "index",
+            expected=f"at most {plain_msgpack.MAX_BYTES} bytes that end at {size - FOOTER.size}",
+            found=f"{index_length} bytes from {index_offset}",
+        )
+    index_bytes = _read(file, path, index_offset, index_length)
+    check_crc(path, "index", index_crc, index_bytes)
+    entries = parse_index(path, index_bytes)
+    check_places(path, entries, header_end, index_offset)
+    header_bytes = _read(file, path, PRELUDE.size, header_length)
+    check_crc(path, "header", header_crc, header_bytes)
+    return _Layout(
+        prelude=prelude,
+        header_bytes=header_bytes,
+        header=parse_header(path, header_bytes),
+        entries=entries,
+        index_bytes=index_bytes,
+        index_offset=index_offset,
+        index_reference=reference,
+        sha256=sha256,
+    )
+
+
+def _read_prelude(file: FileIO, path: Path, size: int) -> tuple[bytes, int, int]:
+    """The checked prelude, the header's length and its CRC."""
+    start = _read(file, path, 0, min(size, PRELUDE.size))
+    check_equal(path, "magic", MAGIC[: max(len(start), 1)], start[: len(MAGIC)], BadMagic)
+    if size < PRELUDE.size + FOOTER.size:
+        raise TruncatedFile.differing(
+            path, "size", expected=f"at least {PRELUDE.size + FOOTER.size} bytes", found=f"{size} bytes"
+        )
+    _, version, header_length, file_size, header_crc, crc = PRELUDE.unpack(start)
+    check_crc(path, "prelude", crc, start[: -CRC.size])
+    check_equal(path, "format version", FORMAT_VERSION, version, UnsupportedVersion)
+    check_equal(path, "size in bytes", file_size, size, TruncatedFile)
+    room = min(plain_msgpack.MAX_BYTES, size - PRELUDE.size - FOOTER.size)
+    if header_length > room:
+        raise MalformedSection.differing(path, "header length", expected=f"at most {room}", found=header_length)
+    return start, header_length, header_crc
+
+
+def _read_whole(file: FileIO, path: Path, layout: _Layout) -> Iterator[tuple[str, AnyArray]]:
+    """Every column; at the end the SHA-256 is checked, so only an exhausted iterator vouches for the file."""
+    digest = hashlib.sha256(layout.prelude + layout.header_bytes)
+    end = PRELUDE.size + len(layout.header_bytes)
+    for entry in layout.entries:
+        digest.update(_read_gap(file, path, end, entry.offset))
+        array = _read_column(file, path, entry)
+        digest.update(_bytes_of(array))
+        end = entry.offset + entry.length
+        yield entry.name, array
+    digest.update(_read_gap(file, path, end, layout.index_offset))
+    digest.update(layout.index_bytes + layout.index_reference)
+    if digest.digest() != layout.sha256:
+        raise ChecksumMismatch.differing(path, "SHA-256", expected=layout.sha256.hex(), found=digest.hexdigest())
+
+
+def _read_column(file: FileIO, path: Path, entry: Entry) -> AnyArray:
+    array = np.empty(entry.shape, DTYPES[entry.dtype_name])
+    _fill(file, path, entry.offset, _bytes_of(array))
+    check_crc(path, f"column {entry.name!r}", entry.crc32, _bytes_of(array))
+    return array
+
+
+def _read_gap(file: FileIO, path: Path, start: int, end: int) -> bytes:
+    gap = _read(file, path, start, end - start)
+    check_equal(path, f"gap at {start}", bytes(len(gap)), gap, MalformedSection)
+    return gap
+
+
+def _read(file: FileIO, path: Path, offset: int, length: int) -> bytes:
+    """``length`` bytes, a number the caller has bounded."""
+    data = bytearray(length)
+    _fill(file, path, offset, memoryview(data))
+    return bytes(data)
+
+
+def _fill(file: FileIO, path: Path, offset: int, target: memoryview) -> None:
+    """Read from ``offset`` until ``target`` is full; one read may give less than asked."""
+    done = 0
+    try:
+        file.seek(offset)
+        while done < len(target):
+            count = file.readinto(target[done:])
+            if not count:
+                raise TruncatedFile.differing(
+                    path, f"bytes from {offset}", expected=len(target), found=f"{done} (cut while being read)"
+                )
+            done += count
+    except OSError as error:
+        raise UnreadableFile(f"{path}: cannot read at {offset + done}: {error.strerror}") from error
+
+
+# --- sections --------------------------------------------------------------------------------------------------------
+
+
+def write_section(path: Path, record: SectionRecord) -> None:
+    """Write a section to ``path``; see :func:`write_columns`."""
+    write_columns(path, record.header(), record.columns())
+
+
+def read_section(path: Path) -> SectionRecord:
+    """The section in a file, every byte and value checked.
+
+    Raises:
+        StorageError: One of the kinds in the format's section 4.
+    """
+    header, columns = read_columns(path)
+    try:
+        return SectionRecord.from_parts(header, columns)
+    except ValueError as error:
+        raise MalformedSection(f"{path}: {error}") from error
