@@ -14,6 +14,7 @@ line, which have no null, the word ``none`` means None where None is allowed.
 """
 
 import dataclasses
+import datetime
 import difflib
 import math
 import re
@@ -29,9 +30,9 @@ from vtslam.common.config_hints import (
     SCALAR_TEXT,
     Range,
     default_of,
+    expected_text,
     nested_class,
     optional_part,
-    range_suffix,
     range_text,
     type_text,
     value_text,
@@ -174,7 +175,7 @@ def _field_value(key: str, hint: Any, default: Any, given: Sequence[tuple[str, A
     if nested is not None:
         return _nested_value(key, nested, optional, default, given, known_keys)
     if default is dataclasses.MISSING and not given:
-        raise ConfigError(f"settings: {key}: no value given; expected {type_text(hint)}{range_suffix(hint)}")
+        raise ConfigError(f"settings: {key}: no value given; expected {expected_text(hint)}")
     value = default
     for origin, found in given:
         try:
@@ -245,8 +246,7 @@ def _checked_tuple(hint: Any, value: Any, bounds: Range | None) -> tuple[Any, ..
 def _checked_scalar(kind: Any, value: Any, bounds: Range | None) -> Any:  # noqa: ANN401
     if kind not in SCALAR_TEXT:
         raise TypeError(f"settings cannot have fields of type {kind!r}")
-    within = "" if bounds is None else f" in the range {bounds}"
-    expected = f"expected {SCALAR_TEXT[kind]}{within}"
+    expected = f"expected {expected_text(kind, bounds)}"
     if kind is float and type(value) is int:
         try:
             value = float(value)
@@ -334,7 +334,8 @@ def _parse_value(key: str, text: str) -> Any:  # noqa: ANN401
     try:
         table = tomllib.loads(f"value = {text}")
         if set(table) == {"value"}:
-            return table["value"]
+            value = table["value"]
+            return text if isinstance(value, datetime.date | datetime.time) else value  # no setting is a date
     except tomllib.TOMLDecodeError:
         if _BARE_WORD.fullmatch(text):
             return text

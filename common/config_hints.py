@@ -2,6 +2,7 @@
 
 import dataclasses
 import types
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -87,10 +88,12 @@ def range_text(hint: Any) -> str:  # noqa: ANN401
     return ", ".join(dict.fromkeys(text for text in texts if text))
 
 
-def range_suffix(hint: Any) -> str:  # noqa: ANN401
-    """The Range as the end of a sentence, or nothing."""
-    text = range_text(hint)
-    return f" in the range {text}" if text else ""
+def expected_text(hint: Any, bounds: Range | None = None) -> str:  # noqa: ANN401
+    """Type and bounds, those at ``hint`` or else ``bounds``, as in "an integer in the range [0, 5]"."""
+    text = range_text(hint) or str(bounds or "")
+    if text.startswith(("[", "(")):
+        text = f"in the range {text}"
+    return f"{type_text(hint)} {text}".rstrip()
 
 
 def value_text(value: Any) -> str:  # noqa: ANN401
@@ -101,4 +104,6 @@ def value_text(value: Any) -> str:  # noqa: ANN401
         return str(value).lower()
     if isinstance(value, list | tuple):
         return f"[{', '.join(value_text(item) for item in value)}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key} = {value_text(item)}' for key, item in value.items())}}}"
     return f'"{value}"' if isinstance(value, str) else str(value)

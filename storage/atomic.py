@@ -48,3 +48,8 @@ def sweep_temporaries(folder: Path) -> None:
     """Delete what crashed writers left in ``folder``; only for the folder's one writer."""
     for path in folder.glob(_TEMPORARY_PATTERN):
         path.unlink(missing_ok=True)
+
+
+def is_temporary(path: Path) -> bool:
+    """Whether ``path`` is named like an unfinished file."""
+    return path.match(_TEMPORARY_PATTERN)
