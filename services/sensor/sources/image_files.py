@@ -1,6 +1,7 @@
 """Reading colour and depth image files strictly, and the source made of one file pair per frame.
 
-OpenCV decodes a cut file as far as it goes and returns it, so each file's structure is checked before it is decoded.
+What OpenCV makes of a cut or damaged file differs by version and format (some return as much as they could decode), so
+each file's structure is checked before it is decoded.
 """
 
 import struct
