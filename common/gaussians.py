@@ -1,0 +1,162 @@
+"""View-tied Gaussians: one small sphere per depth pixel, placed by pixel, depth and pose (paper, section 3.2).
+
+Only colour, radius and opacity are learned. A position is never stored: it follows from the frame the Gaussian is tied
+to, its pixel, that pixel's depth and the frame's pose, so moving a frame moves its Gaussians.
+"""
+
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.geometry.camera import Camera
+from vtslam.common.splat.engine import Splats
+
+# Offset of a Gaussian from its pixel's centre in pixels, by ``subpixel``: 0 is the pixel itself, 1 to 4 the four
+# half-size entries of the edge supplement (the pixel centres of the image at twice the resolution).
+SUBPIXEL_OFFSETS_PX = np.array([[0, 0], [-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]], np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewTiedGaussians:
+    """Struct of arrays over N Gaussians of one section.
+
+    Attributes:
+        frame_index: uint16 [N], row of the section's frame table.
+        pixel: int32 [N], ``row * width + column``.
+        subpixel: uint8 [N], 0 to 4 (``SUBPIXEL_OFFSETS_PX``).
+        depth: uint16 [N], the frame's depth at the pixel, in its own units.
+        colors: float32 [N,3], not clamped.
+        log_radii: float32 [N], natural logarithm of sigma in metres.
+        opacity_logits: float32 [N].
+    """
+
+    frame_index: npt.NDArray[np.uint16]
+    pixel: npt.NDArray[np.int32]
+    subpixel: npt.NDArray[np.uint8]
+    depth: npt.NDArray[np.uint16]
+    colors: npt.NDArray[np.float32]
+    log_radii: npt.NDArray[np.float32]
+    opacity_logits: npt.NDArray[np.float32]
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return int(self.pixel.shape[0])
+
+    @classmethod
+    def empty(cls) -> "ViewTiedGaussians":
+        """No Gaussians."""
+        return cls(
+            frame_index=np.zeros(0, np.uint16),
+            pixel=np.zeros(0, np.int32),
+            subpixel=np.zeros(0, np.uint8),
+            depth=np.zeros(0, np.uint16),
+            colors=np.zeros((0, 3), np.float32),
+            log_radii=np.zeros(0, np.float32),
+            opacity_logits=np.zeros(0, np.float32),
+        )
+
+    def appended(self, other: "ViewTiedGaussians") -> "ViewTiedGaussians":
+        """These Gaussians followed by ``other``'s; rows already here keep their index."""
+        return ViewTiedGaussians(
+            **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
+        )
+
+    def with_attributes(
+        self,
+        *,
+        colors: npt.NDArray[np.float32],
+        log_radii: npt.NDArray[np.float32],
+        opacity_logits: npt.NDArray[np.float32],
+    ) -> "ViewTiedGaussians":
+        """The same ties with other learned attributes."""
+        return ViewTiedGaussians(
+            frame_index=self.frame_index,
+            pixel=self.pixel,
+            subpixel=self.subpixel,
+            depth=self.depth,
+            colors=colors,
+            log_radii=log_radii,
+            opacity_logits=opacity_logits,
+        )
+
+    def points_frame_m(self, camera: Camera, *, depth_unit_m: float) -> npt.NDArray[np.float64]:
+        """Positions float64 [N,3] (m), each in the camera frame it is tied to.
+
+        ``depth_unit_m`` is metres per depth unit, the map's depth factor included.
+        """
+        offset = SUBPIXEL_OFFSETS_PX[self.subpixel]
+        u = self.pixel % camera.width + 0.5 + offset[:, 0].astype(np.float64)
+        v = self.pixel // camera.width + 0.5 + offset[:, 1].astype(np.float64)
+        z = self.depth * depth_unit_m
+        return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+
+    def means_m(
+        self, camera: Camera, T_section_frames: npt.NDArray[np.float64], *, depth_unit_m: float
+    ) -> npt.NDArray[np.float32]:
+        """Positions float32 [N,3] (m) in the section's frame, given its frames' poses float64 [F,4,4]."""
+        points = self.points_frame_m(camera, depth_unit_m=depth_unit_m)
+        out = np.empty((self.count, 3), np.float32)
+        for index in np.unique(self.frame_index):
+            rows = self.frame_index == index
+            T = T_section_frames[index]
+            out[rows] = points[rows] @ T[:3, :3].T + T[:3, 3]
+        return out
+
+    def splats(self, means_m: npt.NDArray[np.float32]) -> Splats:
+        """The Gaussians as a renderer takes them, with their positions already computed."""
+        return Splats(
+            means_m=means_m, colors=self.colors, log_radii=self.log_radii, opacity_logits=self.opacity_logits
+        )
+
+
+def edge_mask(rgb: npt.NDArray[np.uint8], *, low: float, high: float) -> npt.NDArray[np.bool_]:
+    """Edge pixels bool [H,W] of an image uint8 [H,W,3]: Canny with L2 gradient, dilated by 3x3 once."""
+    edges = cv2.Canny(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), low, high, apertureSize=3, L2gradient=True)
+    return np.asarray(cv2.dilate(edges, np.ones((3, 3), np.uint8)) > 0)
+
+
+def tied_to_frame(
+    frame: Frame,
+    mask: npt.NDArray[np.bool_],
+    *,
+    frame_index: int,
+    depth_factor: float,
+    opacity: float,
+    edges: npt.NDArray[np.bool_] | None = None,
+) -> ViewTiedGaussians:
+    """New Gaussians at the pixels of ``mask`` that have depth (paper, section 3.2 and Eq. 3).
+
+    Args:
+        frame: The frame they are tied to.
+        mask: bool [H,W], where Gaussians are wanted.
+        frame_index: Row of the frame in the section's frame table.
+        depth_factor: Factor on depth before placing them.
+        opacity: Initial opacity, 0 to 1.
+        edges: bool [H,W], where four half-size Gaussians are added to the pixel's own, or None.
+
+    Returns:
+        Colour as observed, sigma = depth / focal length (Eq. 3), halved for the edge supplement.
+    """
+    pixels = np.flatnonzero(mask & (frame.depth > 0)).astype(np.int32)
+    subpixel = np.zeros(pixels.size, np.uint8)
+    if edges is not None:
+        edge_pixels = np.flatnonzero(mask & edges & (frame.depth > 0)).astype(np.int32)
+        subpixel = np.concatenate([subpixel, np.tile(np.arange(1, 5, dtype=np.uint8), edge_pixels.size)])
+        pixels = np.concatenate([pixels, np.repeat(edge_pixels, 4)])
+    depth = frame.depth.reshape(-1)[pixels]
+    sigma_m = depth * (frame.depth_scale_m * depth_factor / frame.camera.mean_focal_px)
+    log_radii = np.log(np.where(subpixel > 0, 0.5 * sigma_m, sigma_m)).astype(np.float32)
+    logit = np.float32(np.log(opacity / (1.0 - opacity)))
+    return ViewTiedGaussians(
+        frame_index=np.full(pixels.size, frame_index, np.uint16),
+        pixel=pixels,
+        subpixel=subpixel,
+        depth=depth,
+        colors=frame.rgb_float().reshape(-1, 3)[pixels],
+        log_radii=log_radii,
+        opacity_logits=np.full(pixels.size, logit, np.float32),
+    )

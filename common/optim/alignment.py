@@ -1,0 +1,237 @@
+"""Damped Gauss-Newton alignment of a frame to a rendered view, coarse to fine (the robust, masked form of Eq. 1)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.geometry import se3
+from vtslam.common.geometry.camera import Camera
+from vtslam.common.optim import _align
+from vtslam.common.settings import GaussNewtonSettings
+from vtslam.common.splat.engine import Rendering
+
+FloatImage = npt.NDArray[np.float32]
+
+_MAX_RELATIVE_DEPTH_STEP = 0.05  # neighbours further apart than this share no surface
+_BORDER_PX = 1.0
+_MIN_PIXELS = 30  # six unknowns need a margin
+_DAMPING = 1e-6  # of H's diagonal: keeps a flat wall solvable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObservedLevel:
+    """One pyramid level of a frame: rgb, d rgb/du, d rgb/dv and depth (m), packed float32 [H,W,10]."""
+
+    camera: Camera
+    packed: FloatImage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReferenceLevel:
+    """One pyramid level of a rendered view, seen as a textured surface."""
+
+    camera: Camera
+    rgb: FloatImage
+    depth_m: FloatImage
+    normals: FloatImage
+    mask: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosePrior:
+    """An external estimate of ``T_camera_map`` with its information matrix [6,6] (left twist, camera frame)."""
+
+    T_camera_map: npt.NDArray[np.float64]
+    information: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Alignment:
+    """Result of aligning a frame to one rendered view.
+
+    Attributes:
+        T_observed_reference: float64 [4,4], from the rendered camera to the frame's.
+        information: float64 [6,6], H at the solution (left twist on T_observed_reference).
+        cost: Mean robust cost per pixel, in squared sigmas.
+        visible_share: Pixels used over all pixels, at the finest level.
+        solved: Whether there were enough pixels at the finest level.
+    """
+
+    T_observed_reference: npt.NDArray[np.float64]
+    information: npt.NDArray[np.float64]
+    cost: float
+    visible_share: float
+    solved: bool
+
+
+def _halved_camera(camera: Camera) -> Camera:
+    width, height = camera.width // 2, camera.height // 2
+    return Camera(
+        width=width, height=height, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2, cy=camera.cy / 2
+    )
+
+
+def _quads(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """The four children [4,h,w,...] of each pixel of the halved image; an odd last row or column is left out."""
+    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    return np.stack([image[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
+
+
+def _halved_depth(depth_m: FloatImage) -> FloatImage:
+    """Mean of the four children where all are valid and on one surface, else 0."""
+    quads = _quads(depth_m)
+    low, high = quads.min(axis=0), quads.max(axis=0)
+    one_surface = (low > 0) & (high - low < _MAX_RELATIVE_DEPTH_STEP * low)
+    return np.where(one_surface, quads.mean(axis=0), np.float32(0)).astype(np.float32)
+
+
+def observed_pyramid(rgb: FloatImage, depth_m: FloatImage, camera: Camera, levels: int) -> list[ObservedLevel]:
+    """Pyramid of a frame, finest first: rgb float32 [H,W,3] in 0..1, depth float32 [H,W] (m, 0 = left out)."""
+    out = []
+    for level in range(levels):
+        if level:
+            rgb, depth_m = _quads(rgb).mean(axis=0), _halved_depth(depth_m)
+            camera = _halved_camera(camera)
+        packed = np.empty((camera.height, camera.width, 10), np.float32)
+        packed[..., 0:3] = rgb
+        packed[..., 3:6] = cv2.Scharr(rgb, cv2.CV_32F, 1, 0, scale=1 / 32)
+        packed[..., 6:9] = cv2.Scharr(rgb, cv2.CV_32F, 0, 1, scale=1 / 32)
+        packed[..., 9] = depth_m
+        out.append(ObservedLevel(camera=camera, packed=packed))
+    return out
+
+
+def reference_pyramid(
+    rendering: Rendering, camera: Camera, levels: int, *, silhouette_threshold: float
+) -> list[ReferenceLevel]:
+    """Pyramid of a rendered view, finest first, colour and depth divided by the silhouette where that is high."""
+    covered = rendering.alpha > max(silhouette_threshold, 1e-3)
+    inverse = np.where(covered, 1.0 / np.maximum(rendering.alpha, 1e-3), 0.0).astype(np.float32)
+    rgb, depth_m = rendering.rgb * inverse[..., None], rendering.depth_m * inverse
+    mask = covered.astype(np.uint8)
+    out = []
+    for level in range(levels):
+        if level:
+            rgb, depth_m = _quads(rgb).mean(axis=0), _halved_depth(depth_m)
+            mask = _quads(mask.astype(np.float32)).min(axis=0).astype(np.uint8)
+            camera = _halved_camera(camera)
+        normals = _align.normals_from_depth(depth_m, _intrinsics(camera), _MAX_RELATIVE_DEPTH_STEP)
+        out.append(
+            ReferenceLevel(
+                camera=camera, rgb=np.ascontiguousarray(rgb), depth_m=depth_m, normals=np.asarray(normals), mask=mask
+            )
+        )
+    return out
+
+
+def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _System:
+    H: npt.NDArray[np.float64]
+    g: npt.NDArray[np.float64]
+    mean_cost: float
+    visible: int
+
+
+def _linearised(
+    reference: ReferenceLevel,
+    observed: ObservedLevel,
+    T: npt.NDArray[np.float64],
+    settings: GaussNewtonSettings,
+    prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None,
+    threads: int,
+) -> _System:
+    """H, g and cost at ``T``; the prior is (T_observed_reference it asks for, information)."""
+    options = _align.AlignmentOptions(
+        color_sigma=settings.color_sigma,
+        color_weight=settings.color_weight,
+        depth_sigma_base=settings.depth_sigma_base_m,
+        depth_sigma_quadratic=settings.depth_sigma_per_m,
+        depth_weight=settings.depth_weight,
+        depth_gate_sigmas=settings.depth_gate_sigmas,
+        border_px=_BORDER_PX,
+    )
+    H, g, color_cost, depth_cost, _, _, visible = _align.normal_equations(
+        reference.rgb,
+        reference.depth_m,
+        reference.normals,
+        reference.mask,
+        observed.packed,
+        _intrinsics(reference.camera),
+        np.ascontiguousarray(T),
+        options,
+        threads,
+    )
+    H, g, cost = np.asarray(H), np.asarray(g), color_cost + depth_cost
+    if prior is not None:
+        error = se3.log(T @ se3.inverse(prior[0]))
+        H, g, cost = H + prior[1], g + prior[1] @ error, cost + 0.5 * float(error @ prior[1] @ error)
+    return _System(H=H, g=g, mean_cost=cost / max(visible, 1), visible=visible)
+
+
+def align(
+    reference: list[ReferenceLevel],
+    observed: list[ObservedLevel],
+    settings: GaussNewtonSettings,
+    *,
+    T_observed_reference: npt.NDArray[np.float64],
+    prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None = None,
+    coarsest: int,
+    threads: int = 1,
+) -> Alignment:
+    """Move the frame's camera until the rendered surface agrees with the frame, from level ``coarsest`` to 0.
+
+    Args:
+        reference: Pyramid of the rendered view.
+        observed: Pyramid of the frame.
+        settings: Noise model, iterations and convergence test.
+        T_observed_reference: float64 [4,4], first guess.
+        prior: (pose it asks for, information [6,6]) or None.
+        coarsest: Level to start at.
+        threads: Threads of the kernel; the result does not depend on it.
+    """
+    T = T_observed_reference
+    system: _System | None = None
+    for level in range(min(coarsest, len(reference) - 1, len(observed) - 1), -1, -1):
+        T, system = _solved_level(reference[level], observed[level], T, settings, prior, threads)
+    assert system is not None
+    pixels = reference[0].camera.width * reference[0].camera.height
+    return Alignment(
+        T_observed_reference=T,
+        information=system.H,
+        cost=system.mean_cost,
+        visible_share=system.visible / pixels,
+        solved=system.visible >= _MIN_PIXELS,
+    )
+
+
+def _solved_level(
+    reference: ReferenceLevel,
+    observed: ObservedLevel,
+    T: npt.NDArray[np.float64],
+    settings: GaussNewtonSettings,
+    prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None,
+    threads: int,
+) -> tuple[npt.NDArray[np.float64], _System]:
+    """Gauss-Newton on one level; a step that raises the mean cost is halved once, then ends the level."""
+    system = _linearised(reference, observed, T, settings, prior, threads)
+    for _ in range(settings.iterations):
+        if system.visible < _MIN_PIXELS:
+            break
+        damped = system.H + _DAMPING * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
+        step = -np.linalg.solve(damped, system.g)
+        trial = _linearised(reference, observed, se3.exp(step) @ T, settings, prior, threads)
+        if trial.mean_cost > system.mean_cost or trial.visible < _MIN_PIXELS:
+            step = 0.5 * step
+            trial = _linearised(reference, observed, se3.exp(step) @ T, settings, prior, threads)
+            if trial.mean_cost > system.mean_cost or trial.visible < _MIN_PIXELS:
+                break
+        T, system = se3.exp(step) @ T, trial
+        if np.linalg.norm(step[:3]) < settings.converged_m and np.linalg.norm(step[3:]) < settings.converged_rad:
+            break
+    return T, system

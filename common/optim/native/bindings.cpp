@@ -1,0 +1,129 @@
+// Python bindings of the alignment kernels: shapes checked, GIL released, one call.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/tuple.h>
+
+#include <tuple>
+
+#include "alignment.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+template <typename T, int Dims>
+using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, nb::ndim<Dims>>;
+template <typename T, int Dims>
+using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, nb::ndim<Dims>>;
+
+template <typename A>
+void require(const A& array, std::initializer_list<size_t> shape, const char* name) {
+  size_t axis = 0;
+  for (size_t extent : shape) {
+    if (array.shape(axis++) != extent) throw nb::value_error((std::string(name) + ": wrong shape").c_str());
+  }
+}
+
+template <typename T>
+T* owned(size_t count, nb::capsule& owner) {
+  T* data = new T[count];
+  owner = nb::capsule(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  return data;
+}
+
+vtslam::Pinhole pinhole(const std::tuple<float, float, float, float>& k) {
+  return {std::get<0>(k), std::get<1>(k), std::get<2>(k), std::get<3>(k)};
+}
+
+using Intrinsics = std::tuple<float, float, float, float>;
+
+nb::tuple normal_equations(In<float, 3> rgb, In<float, 2> depth, In<float, 3> normals, In<uint8_t, 2> mask,
+                           In<float, 3> packed, Intrinsics camera, In<double, 2> T_observed_reference,
+                           const vtslam::AlignmentOptions& options, int threads) {
+  const size_t h = depth.shape(0), w = depth.shape(1);
+  require(rgb, {h, w, 3}, "rgb");
+  require(normals, {h, w, 3}, "normals");
+  require(mask, {h, w}, "mask");
+  require(packed, {h, w, 10}, "packed");
+  require(T_observed_reference, {4, 4}, "T_observed_reference");
+  if (h < 2 || w < 2) throw nb::value_error("images need at least 2x2 pixels");
+  const double* T = T_observed_reference.data();
+  const double R[9] = {T[0], T[1], T[2], T[4], T[5], T[6], T[8], T[9], T[10]};
+  const double t[3] = {T[3], T[7], T[11]};
+  vtslam::NormalEquations out;
+  {
+    nb::gil_scoped_release release;
+    out = vtslam::normal_equations({rgb.data(), depth.data(), normals.data(), mask.data()}, {packed.data()},
+                                   static_cast<int>(w), static_cast<int>(h), pinhole(camera), R, t, options, threads);
+  }
+  nb::capsule h_owner, g_owner;
+  double* H = owned<double>(36, h_owner);
+  double* g = owned<double>(6, g_owner);
+  int k = 0;
+  for (int i = 0; i < 6; ++i) {
+    g[i] = out.g[i];
+    for (int j = i; j < 6; ++j) H[6 * i + j] = H[6 * j + i] = out.H[k++];
+  }
+  return nb::make_tuple(Out<double, 2>(H, {6, 6}, h_owner), Out<double, 1>(g, {6}, g_owner), out.color_cost,
+                        out.depth_cost, out.color_count, out.depth_count, out.visible_count);
+}
+
+Out<float, 3> normals_from_depth(In<float, 2> depth, Intrinsics camera, float max_relative_step) {
+  const size_t h = depth.shape(0), w = depth.shape(1);
+  nb::capsule owner;
+  float* normals = owned<float>(3 * h * w, owner);
+  {
+    nb::gil_scoped_release release;
+    vtslam::normals_from_depth(depth.data(), static_cast<int>(w), static_cast<int>(h), pinhole(camera),
+                               max_relative_step, normals);
+  }
+  return Out<float, 3>(normals, {h, w, 3}, owner);
+}
+
+nb::tuple tracking_loss(In<float, 3> rgb, In<float, 2> depth, In<float, 2> alpha, In<float, 3> target_rgb,
+                        In<float, 2> target_depth, In<uint8_t, 2> mask, float silhouette_threshold, float color_weight,
+                        float depth_weight) {
+  const size_t h = depth.shape(0), w = depth.shape(1);
+  require(rgb, {h, w, 3}, "rgb");
+  require(alpha, {h, w}, "alpha");
+  require(target_rgb, {h, w, 3}, "target_rgb");
+  require(target_depth, {h, w}, "target_depth");
+  require(mask, {h, w}, "mask");
+  nb::capsule rgb_owner, depth_owner;
+  float* d_rgb = owned<float>(3 * h * w, rgb_owner);
+  float* d_depth = owned<float>(h * w, depth_owner);
+  vtslam::TrackingLoss loss;
+  {
+    nb::gil_scoped_release release;
+    loss = vtslam::tracking_loss({rgb.data(), depth.data(), alpha.data(), target_rgb.data(), target_depth.data(),
+                                  mask.data(), silhouette_threshold, color_weight, depth_weight},
+                                 h * w, d_rgb, d_depth);
+  }
+  return nb::make_tuple(loss.color_sum, loss.depth_sum, loss.count, Out<float, 3>(d_rgb, {h, w, 3}, rgb_owner),
+                        Out<float, 2>(d_depth, {h, w}, depth_owner));
+}
+
+}  // namespace
+
+NB_MODULE(_align, m) {
+  m.doc() = "Dense RGB-D alignment and the tracking loss.";
+  nb::class_<vtslam::AlignmentOptions>(m, "AlignmentOptions")
+      .def(
+          "__init__",
+          [](vtslam::AlignmentOptions* self, float color_sigma, float color_weight, float depth_sigma_base,
+             float depth_sigma_quadratic, float depth_weight, float depth_gate_sigmas, float border_px) {
+            new (self) vtslam::AlignmentOptions{color_sigma,  color_weight,      depth_sigma_base, depth_sigma_quadratic,
+                                                depth_weight, depth_gate_sigmas, border_px};
+          },
+          nb::kw_only(), "color_sigma"_a, "color_weight"_a, "depth_sigma_base"_a, "depth_sigma_quadratic"_a,
+          "depth_weight"_a, "depth_gate_sigmas"_a, "border_px"_a);
+  m.def("normal_equations", &normal_equations, "rgb"_a, "depth"_a, "normals"_a, "mask"_a, "packed"_a, "camera"_a,
+        "T_observed_reference"_a, "options"_a, "threads"_a,
+        "H [6,6], g [6], colour cost, depth cost, colour count, depth count, visible count.");
+  m.def("normals_from_depth", &normals_from_depth, "depth"_a, "camera"_a, "max_relative_step"_a,
+        "Unit normals [H,W,3] of a depth image (m); zero where unknown.");
+  m.def("tracking_loss", &tracking_loss, "rgb"_a, "depth"_a, "alpha"_a, "target_rgb"_a, "target_depth"_a, "mask"_a,
+        "silhouette_threshold"_a, "color_weight"_a, "depth_weight"_a,
+        "Eq. 1: colour sum, depth sum, pixel count, d_rgb [H,W,3], d_depth [H,W].");
+}

@@ -1,0 +1,1 @@
+"""Presets: schedules and families as TOML files."""

@@ -1,0 +1,96 @@
+"""A section: N consecutive frames, the Gaussians tied to them, and the views that answer overlap questions."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.gaussians import ViewTiedGaussians
+from vtslam.common.geometry import se3
+from vtslam.common.geometry.camera import Camera
+from vtslam.common.splat.engine import Splats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SectionFrame:
+    """A frame of a section.
+
+    Attributes:
+        frame_id: Its place in the stream.
+        capture_time_ns: Capture time.
+        T_section_frame: float64 [4,4], camera coordinates to section coordinates.
+        view_depth: uint16 [H,W] if the frame answers overlap or visibility questions, else None.
+    """
+
+    frame_id: int
+    capture_time_ns: int
+    T_section_frame: npt.NDArray[np.float64]
+    view_depth: npt.NDArray[np.uint16] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Section:
+    """A section of the map. Its head frame comes first; the head's pose at creation is the section's frame.
+
+    Attributes:
+        section_id: From 0, in order of creation.
+        T_world_section: float64 [4,4], the anchor.
+        camera: Intrinsics of all its frames.
+        depth_scale_m: Metres per unit of frame depth.
+        depth_factor: Factor on depth when Gaussians are placed.
+        frames: The frame table.
+        gaussians: The Gaussians tied to those frames.
+        means_m: float32 [N,3], their positions in section coordinates; recomputed from the rest, never stored.
+    """
+
+    section_id: int
+    T_world_section: npt.NDArray[np.float64]
+    camera: Camera
+    depth_scale_m: float
+    depth_factor: float
+    frames: tuple[SectionFrame, ...]
+    gaussians: ViewTiedGaussians
+    means_m: npt.NDArray[np.float32]
+
+    def retied(self) -> "Section":
+        """The section with positions computed anew from its frames' poses."""
+        poses = np.stack([f.T_section_frame for f in self.frames]) if self.frames else np.zeros((0, 4, 4))
+        means = self.gaussians.means_m(self.camera, poses, depth_unit_m=self.depth_unit_m)
+        return replace(self, means_m=means)
+
+    @property
+    def depth_unit_m(self) -> float:
+        """Metres per unit of depth as Gaussians are placed."""
+        return self.depth_scale_m * self.depth_factor
+
+    @property
+    def splats(self) -> Splats:
+        """All Gaussians in section coordinates."""
+        return self.gaussians.splats(self.means_m)
+
+    @property
+    def head(self) -> SectionFrame:
+        """The first frame."""
+        return self.frames[0]
+
+    def T_world_frame(self, index: int) -> npt.NDArray[np.float64]:
+        """Pose ``T_world_camera`` float64 [4,4] of the frame in row ``index``."""
+        return self.T_world_section @ self.frames[index].T_section_frame
+
+    def T_section_camera(self, T_world_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """A world pose as seen from the section."""
+        return se3.inverse(self.T_world_section) @ T_world_camera
+
+
+def joined_splats(sections: list[Section], *, into: Section) -> Splats:
+    """Gaussians of several sections in the coordinates of ``into`` (Eq. 2: the current and its neighbours)."""
+    means = []
+    for section in sections:
+        T = se3.inverse(into.T_world_section) @ section.T_world_section
+        means.append((section.means_m @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+    return Splats(
+        means_m=np.concatenate(means),
+        colors=np.concatenate([s.gaussians.colors for s in sections]),
+        log_radii=np.concatenate([s.gaussians.log_radii for s in sections]),
+        opacity_logits=np.concatenate([s.gaussians.opacity_logits for s in sections]),
+    )

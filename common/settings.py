@@ -1,0 +1,246 @@
+"""The settings tree: schedule (how) times family (what kind of recording), every key typed and bounded.
+
+The defaults below are the figures of family ``tum`` under schedule ``paper``; presets in ``common/presets`` state what
+differs. Figures come from the paper's implementation details and its authors' program.
+"""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from vtslam.common.config import Range
+
+Positive = Annotated[float, Range(0.0, low_open=True)]
+NonNegative = Annotated[float, Range(0.0)]
+Fraction = Annotated[float, Range(0.0, 1.0)]
+Count = Annotated[int, Range(0)]
+PositiveCount = Annotated[int, Range(1)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceSettings:
+    """What of the source is used; empty values keep the source's own.
+
+    Attributes:
+        size: "WxH" to scale frames to.
+        frames: "A:B", the part of the recording.
+        noise: Depth and colour noise of a simulated source.
+        seed: Seed of a simulated source.
+    """
+
+    size: str = ""
+    frames: str = ""
+    noise: Literal["", "none", "kinect"] = ""
+    seed: Annotated[int, Range(-1, 2**31)] = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplatSettings:
+    """The rasteriser (design section 5).
+
+    Attributes:
+        engine: Which one.
+        threads: Threads of the CPU engine; 0 for one per available core.
+        low_pass_px2: Added to the diagonal of the image covariance, px^2.
+        near_m: Gaussians nearer than this are not drawn.
+        alpha_cap: Upper bound of one Gaussian's alpha.
+    """
+
+    engine: Literal["native", "gsplat", "reference"] = "native"
+    threads: Annotated[int, Range(0, 256)] = 0
+    low_pass_px2: Annotated[float, Range(0.0, 10.0)] = 0.001
+    near_m: Positive = 0.2
+    alpha_cap: Annotated[float, Range(0.5, 0.9999)] = 0.999
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SectionSettings:
+    """How the stream is cut into sections.
+
+    Attributes:
+        length: Frames of a section, N.
+        candidate_interval: Every so many frames one answers overlap questions, N_1.
+    """
+
+    length: Annotated[int, Range(2, 10000)] = 30
+    candidate_interval: PositiveCount = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OverlapSettings:
+    """Choice of the overlapping section (paper, section 3.3).
+
+    Attributes:
+        gamma: Share of the frame's points a candidate view must see.
+        gamma_decay: Factor on gamma while too few sections pass.
+        gamma_floor: Gamma below which the search ends.
+        depth_consistency: Relative depth difference up to which a point counts as seen.
+        border_share: Image border that does not count, as a share of the width.
+        max_sections: Sections that are pre-tracked.
+        skip_previous: Leave out the previous section's views but its head's, as the authors' program does.
+    """
+
+    gamma: Fraction = 0.26
+    gamma_decay: Annotated[float, Range(0.1, 0.99)] = 0.8
+    gamma_floor: Annotated[float, Range(0.0, 1.0, low_open=True)] = 0.01
+    depth_consistency: Annotated[float, Range(0.0, 1.0, low_open=True)] = 0.01
+    border_share: Annotated[float, Range(0.0, 0.4)] = 0.03125
+    max_sections: PositiveCount = 3
+    skip_previous: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdamSettings:
+    """Pose by first-order descent on Eq. 1, as the paper does it.
+
+    Attributes:
+        iterations: Renders of a frame.
+        first_section_iterations: The same within section 0.
+        pretrack_iterations: Renders per candidate section of a head.
+        learning_rate_rotation: On the unnormalised quaternion.
+        learning_rate_translation: Metres.
+        silhouette_threshold: Pixels need a silhouette above this.
+        silhouette_adaptive: Choose the threshold per frame by the colour error at the first guess.
+        color_weight: Alpha of Eq. 1.
+        depth_weight: Beta of Eq. 1.
+    """
+
+    iterations: PositiveCount = 200
+    first_section_iterations: PositiveCount = 200
+    pretrack_iterations: PositiveCount = 31
+    learning_rate_rotation: Positive = 0.002
+    learning_rate_translation: Positive = 0.002
+    silhouette_threshold: Fraction = 0.99
+    silhouette_adaptive: bool = False
+    color_weight: NonNegative = 0.5
+    depth_weight: NonNegative = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GaussNewtonSettings:
+    """Pose by damped Gauss-Newton on the robust, masked form of Eq. 1: few renders, coarse to fine.
+
+    Attributes:
+        renders: Renders of a frame at most; each is aligned to the frame until that converges.
+        levels: Image pyramid levels; the coarsest is 2^(levels-1) times smaller.
+        iterations: Steps per level at most.
+        converged_m: A step smaller than this, in metres, ends a level ...
+        converged_rad: ... if its rotation is smaller than this too.
+        silhouette_threshold: Pixels need a silhouette above this.
+        color_sigma: Scale at which colour residuals (0..1) stop being quadratic.
+        color_weight: Weight of colour against depth.
+        depth_weight: Weight of depth.
+        depth_sigma_base_m: Depth noise at 0 m ...
+        depth_sigma_per_m: ... and its growth with the square of depth (1/m).
+        depth_gate_sigmas: Pairs further apart than this are taken for occlusions.
+    """
+
+    renders: PositiveCount = 3
+    levels: Annotated[int, Range(1, 6)] = 3
+    iterations: PositiveCount = 10
+    converged_m: Positive = 2e-5
+    converged_rad: Positive = 1e-5
+    silhouette_threshold: Fraction = 0.9
+    color_sigma: Positive = 0.03
+    color_weight: NonNegative = 1.0
+    depth_weight: NonNegative = 1.0
+    depth_sigma_base_m: Positive = 0.002
+    depth_sigma_per_m: NonNegative = 0.0015
+    depth_gate_sigmas: Positive = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackerSettings:
+    """Pose of a frame (paper, section 3.3).
+
+    Attributes:
+        optimizer: Which one.
+        visibility: Mask heads by what the overlapping section's first, middle and last frame saw.
+        visibility_tolerance: Relative depth difference up to which a pixel counts as seen.
+        far_factor: Depth beyond this many times the mean of the 30 largest mean depths is left out; 0 keeps all.
+        rescue_factor: Loss at the guess over the usual loss, above which RGB-D odometry is asked.
+        weak_covered_share: Below this share of usable pixels the pose is called weak.
+        lost_covered_share: Below this it is called lost.
+        lost_loss_factor: Final loss over the usual loss, above which it is called lost.
+    """
+
+    optimizer: Literal["adam", "gauss_newton"] = "adam"
+    visibility: bool = True
+    visibility_tolerance: Annotated[float, Range(0.0, 1.0, low_open=True)] = 0.01
+    far_factor: NonNegative = 1.5
+    rescue_factor: Positive = 50.0
+    weak_covered_share: Fraction = 0.1
+    lost_covered_share: Fraction = 0.01
+    lost_loss_factor: Positive = 20.0
+    adam: AdamSettings = field(default_factory=AdamSettings)
+    gauss_newton: GaussNewtonSettings = field(default_factory=GaussNewtonSettings)
+    overlap: OverlapSettings = field(default_factory=OverlapSettings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapperSettings:
+    """Growth and optimisation of the active section (paper, sections 3.4 and 3.5).
+
+    Attributes:
+        iterations_head: Optimiser steps at a head.
+        iterations_regular: Optimiser steps at another frame.
+        iterations_seal: Steps over all frames of a section when it is finished.
+        learning_rate_color: Adam's rate of colours.
+        learning_rate_log_radius: ... of log radii.
+        learning_rate_opacity: ... of opacity logits.
+        keep_moments: Keep Adam's moments from frame to frame of a section.
+        color_weight: Weight of the colour terms, of Eq. 2.
+        depth_weight: Sigma of Eq. 2.
+        ssim_share: Share of the structural term in the colour terms.
+        neighbour_weight: Weight of the loss with the previous and overlapping sections (Eq. 2); 0 leaves it out.
+        prior_weight: Pull of the attributes towards what was observed, per step.
+        depth_factor: Factor on depth when Gaussians are placed.
+        initial_opacity: Opacity of a new Gaussian.
+        edge_supplement: Add four half-size Gaussians on edge pixels.
+        edge_low: Lower Canny threshold.
+        edge_high: Upper Canny threshold.
+        uncovered_silhouette: Pixels with a smaller silhouette get Gaussians.
+        uncovered_depth_factor: So do those whose rendered depth lies behind by this many median errors; 0 never.
+        bundle_rotation_rate: Adam's rate of a head's rotation while it is mapped, radians; 0 keeps it.
+        bundle_translation_rate: The same for its translation, metres.
+    """
+
+    iterations_head: Count = 30
+    iterations_regular: Count = 30
+    iterations_seal: Count = 0
+    learning_rate_color: NonNegative = 0.0025
+    learning_rate_log_radius: NonNegative = 0.005
+    learning_rate_opacity: NonNegative = 0.05
+    keep_moments: bool = False
+    color_weight: NonNegative = 1.0
+    depth_weight: NonNegative = 1.0
+    ssim_share: Fraction = 0.2
+    neighbour_weight: NonNegative = 1.0
+    prior_weight: NonNegative = 0.0
+    depth_factor: Annotated[float, Range(0.9, 1.1)] = 1.0
+    initial_opacity: Annotated[float, Range(0.01, 0.99)] = 0.5
+    edge_supplement: bool = False
+    edge_low: NonNegative = 50.0
+    edge_high: NonNegative = 200.0
+    uncovered_silhouette: Fraction = 0.5
+    uncovered_depth_factor: NonNegative = 50.0
+    bundle_rotation_rate: NonNegative = 1e-4
+    bundle_translation_rate: NonNegative = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """All settings of a run.
+
+    Attributes:
+        seed: Key of every random choice.
+        holdout: Every so many regular frames one is tracked but kept out of mapping; 0 none.
+        source, splat, section, tracker, mapper: The parts.
+    """
+
+    seed: Annotated[int, Range(0, 2**31)] = 2
+    holdout: Count = 0
+    source: SourceSettings = field(default_factory=SourceSettings)
+    splat: SplatSettings = field(default_factory=SplatSettings)
+    section: SectionSettings = field(default_factory=SectionSettings)
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    mapper: MapperSettings = field(default_factory=MapperSettings)

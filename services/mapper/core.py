@@ -1,0 +1,208 @@
+"""The mapper: grows the active section with each frame and optimises it (paper, sections 3.2, 3.4 and 3.5).
+
+Pure: no bus, clock or files. Random choices are keyed by (seed, frame), so a restart repeats them.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.gaussians import ViewTiedGaussians, edge_mask, tied_to_frame
+from vtslam.common.geometry import se3
+from vtslam.common.section import Section, SectionFrame
+from vtslam.common.settings import MapperSettings, SectionSettings
+from vtslam.common.splat.engine import Engine, Rendering
+from vtslam.services.mapper.bundle import HeadBundle
+from vtslam.services.mapper.optimise import Optimised, SectionOptimiser
+from vtslam.services.mapper.state import ActiveSection, CommitRecord, TrainingView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mapper:
+    """Settings and engine of the mapper; holds no state of the stream."""
+
+    settings: MapperSettings
+    section_settings: SectionSettings
+    engine: Engine
+    seed: int
+
+    def map_head(
+        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], *, section_id: int, neighbours: list[Section]
+    ) -> tuple[ActiveSection, CommitRecord]:
+        """Open a section at its head: a Gaussian at every pixel with depth, optimised with its neighbours (Eq. 2).
+
+        Args:
+            frame: The head.
+            T_world_camera: float64 [4,4], its tracked pose; bundle adjustment may move it.
+            section_id: The new section.
+            neighbours: The previous and the overlapping section, without repetition; empty for section 0.
+        """
+        section = Section(
+            section_id=section_id,
+            T_world_section=T_world_camera,
+            camera=frame.camera,
+            depth_scale_m=frame.depth_scale_m,
+            depth_factor=self.settings.depth_factor,
+            frames=(self._section_frame(frame, np.eye(4), 0),),
+            gaussians=self._tied(frame, frame.depth > 0, 0),
+            means_m=np.zeros((0, 3), np.float32),
+        ).retied()
+        view = TrainingView(frame_index=0, frame=frame)
+        optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None)
+        bundle = HeadBundle(T_world_camera, self.settings)
+        if section.gaussians.count:
+            for _ in range(self.settings.iterations_head):
+                pose_gradient = optimiser.step(view, with_neighbours=True)
+                optimiser.move_anchor(bundle.moved(pose_gradient))
+        result = optimiser.finished()
+        active = ActiveSection(
+            section=result.section,
+            views=(view,),
+            neighbour_ids=tuple(n.section_id for n in neighbours),
+            moments=result.moments,
+        )
+        added = section.gaussians.count
+        return active, self._record(frame, active, result, added, self.settings.iterations_head, held_out=False)
+
+    def map_regular(
+        self,
+        frame: Frame,
+        T_world_camera: npt.NDArray[np.float64],
+        active: ActiveSection,
+        *,
+        neighbours: list[Section],
+        held_out: bool = False,
+    ) -> tuple[ActiveSection, CommitRecord]:
+        """Complement the section where it does not cover the frame, and optimise it on random views of its own.
+
+        Args:
+            frame: A frame that is no head.
+            T_world_camera: float64 [4,4], its tracked pose.
+            active: The section so far.
+            neighbours: The sections named by ``active.neighbour_ids``.
+            held_out: Record the pose only: add nothing, learn nothing from it.
+        """
+        row = len(active.section.frames)
+        T_section_frame = active.section.T_section_camera(T_world_camera)
+        stored = self._section_frame(frame, T_section_frame, row)
+        section = replace(active.section, frames=(*active.section.frames, stored))
+        views, added = active.views, 0
+        if not held_out:
+            new = self._tied(frame, self._uncovered(section, frame, T_section_frame), row)
+            section, added = self._grown(section, new), new.count
+            views = (*views, TrainingView(frame_index=row, frame=frame))
+        chosen = self._random_views(frame.frame_id, len(views), self.settings.iterations_regular)
+        result = self._optimised(section, neighbours, active, views, chosen)
+        grown = ActiveSection(
+            section=result.section, views=views, neighbour_ids=active.neighbour_ids, moments=result.moments
+        )
+        return grown, self._record(frame, grown, result, added, len(chosen), held_out=held_out)
+
+    def seal(self, active: ActiveSection, *, neighbours: list[Section]) -> tuple[Section, int]:
+        """Finish a section: a last round over all its views; afterwards its payload never changes.
+
+        Returns:
+            The section and the renders spent.
+        """
+        count = self.settings.iterations_seal
+        key = self._section_key(active.section)
+        chosen = self._even_views(key, len(active.views), count)
+        result = self._optimised(active.section, neighbours, active, active.views, chosen)
+        section = result.section
+        last = active.views[-1]
+        frames = list(section.frames)
+        frames[last.frame_index] = replace(frames[last.frame_index], view_depth=last.frame.depth)
+        return replace(section, frames=tuple(frames)), result.renders
+
+    def _optimised(
+        self,
+        section: Section,
+        neighbours: list[Section],
+        active: ActiveSection,
+        views: tuple[TrainingView, ...],
+        chosen: npt.NDArray[np.int64],
+    ) -> Optimised:
+        optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
+        if section.gaussians.count:
+            for index in chosen:
+                # The head alone is shared with the neighbours (method 7.3).
+                optimiser.step(views[index], with_neighbours=index == 0)
+        return optimiser.finished()
+
+    def _section_frame(self, frame: Frame, T_section_frame: npt.NDArray[np.float64], row: int) -> SectionFrame:
+        keeps_depth = row % self.section_settings.candidate_interval == 0 or row == self.section_settings.length // 2
+        return SectionFrame(
+            frame_id=frame.frame_id,
+            capture_time_ns=frame.capture_time_ns,
+            T_section_frame=T_section_frame,
+            view_depth=frame.depth if keeps_depth else None,
+        )
+
+    def _tied(self, frame: Frame, mask: npt.NDArray[np.bool_], row: int) -> ViewTiedGaussians:
+        s = self.settings
+        return tied_to_frame(
+            frame,
+            mask,
+            frame_index=row,
+            depth_factor=s.depth_factor,
+            opacity=s.initial_opacity,
+            edges=edge_mask(frame.rgb, low=s.edge_low, high=s.edge_high) if s.edge_supplement else None,
+        )
+
+    def _uncovered(
+        self, section: Section, frame: Frame, T_section_frame: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.bool_]:
+        """Pixels where the section shows nothing, or something far behind what was measured (method 7.1)."""
+        if section.gaussians.count == 0:
+            return frame.depth > 0
+        rendering: Rendering = self.engine.render(section.splats, frame.camera, se3.inverse(T_section_frame))
+        uncovered = rendering.alpha < self.settings.uncovered_silhouette
+        depth_m, valid = frame.depth_m(), frame.depth > 0
+        if self.settings.uncovered_depth_factor > 0 and valid.any():
+            error = np.abs(rendering.depth_m - depth_m)
+            limit = self.settings.uncovered_depth_factor * float(np.median(error[valid]))
+            uncovered |= (rendering.depth_m > depth_m) & (error > limit) & valid
+        return np.asarray(uncovered)
+
+    def _grown(self, section: Section, new: ViewTiedGaussians) -> Section:
+        means = new.means_m(
+            section.camera, np.stack([f.T_section_frame for f in section.frames]), depth_unit_m=section.depth_unit_m
+        )
+        return replace(
+            section, gaussians=section.gaussians.appended(new), means_m=np.concatenate([section.means_m, means])
+        )
+
+    def _random_views(self, frame_id: int, views: int, count: int) -> npt.NDArray[np.int64]:
+        """Uniform choices among the section's views up to now, keyed by (seed, frame)."""
+        generator = np.random.Generator(np.random.Philox(key=np.array([self.seed, frame_id], np.uint64)))
+        return generator.integers(0, views, size=count)
+
+    def _even_views(self, key: int, views: int, count: int) -> npt.NDArray[np.int64]:
+        """Every view equally often, in an order keyed by (seed, section)."""
+        generator = np.random.Generator(np.random.Philox(key=np.array([self.seed, key], np.uint64)))
+        rounds = [generator.permutation(views) for _ in range(-(-count // views))]
+        return np.concatenate([*rounds, np.zeros(0, np.int64)])[:count].astype(np.int64)
+
+    @staticmethod
+    def _section_key(section: Section) -> int:
+        """A key that no frame uses."""
+        return 2**40 + section.section_id
+
+    def _record(
+        self, frame: Frame, active: ActiveSection, result: Optimised, added: int, iterations: int, *, held_out: bool
+    ) -> CommitRecord:
+        section = active.section
+        return CommitRecord(
+            frame_id=frame.frame_id,
+            section_id=section.section_id,
+            frame_index=len(section.frames) - 1,
+            T_world_camera=section.T_world_frame(len(section.frames) - 1),
+            gaussians_added=added,
+            gaussians=section.gaussians.count,
+            iterations=iterations,
+            renders=result.renders,
+            loss=result.loss,
+            held_out=held_out,
+        )

@@ -1,0 +1,138 @@
+"""Optimisation of one section's attributes on its own views and, with its neighbours, on its head (Eq. 2)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.geometry import se3
+from vtslam.common.optim.adam import Adam
+from vtslam.common.optim.mapping_loss import mapping_loss
+from vtslam.common.section import Section, joined_splats
+from vtslam.common.settings import MapperSettings
+from vtslam.common.splat.engine import Engine, Gradients, Splats
+from vtslam.services.mapper.state import Moments, TrainingView
+
+_EPSILON = 1e-15  # of Adam in mapping (method 5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Optimised:
+    """A section after some steps, the optimiser state, the last loss and the renders spent."""
+
+    section: Section
+    moments: Moments
+    loss: float
+    renders: int
+
+
+def new_moments(section: Section, settings: MapperSettings, *, previous: Moments | None) -> Moments:
+    """Optimiser state for a section's Gaussians; kept rows continue where they were, new rows start at zero."""
+    g = section.gaussians
+    if previous is not None and settings.keep_moments:
+        return Moments(
+            colors=previous.colors.grown(g.count),
+            log_radii=previous.log_radii.grown(g.count),
+            opacity_logits=previous.opacity_logits.grown(g.count),
+        )
+    return Moments(
+        colors=Adam.zeros(g.colors.shape, learning_rate=settings.learning_rate_color, epsilon=_EPSILON),
+        log_radii=Adam.zeros(g.log_radii.shape, learning_rate=settings.learning_rate_log_radius, epsilon=_EPSILON),
+        opacity_logits=Adam.zeros(g.log_radii.shape, learning_rate=settings.learning_rate_opacity, epsilon=_EPSILON),
+    )
+
+
+class SectionOptimiser:
+    """Steps of Adam on colours, log radii and opacity logits; positions and neighbours stay fixed."""
+
+    def __init__(
+        self,
+        section: Section,
+        neighbours: list[Section],
+        engine: Engine,
+        settings: MapperSettings,
+        *,
+        moments: Moments | None,
+    ) -> None:
+        self._section, self._neighbours, self._engine, self._settings = section, neighbours, engine, settings
+        self._moments = new_moments(section, settings, previous=moments)
+        g = section.gaussians
+        self._colors, self._log_radii = g.colors.copy(), g.log_radii.copy()
+        self._opacity_logits = g.opacity_logits.copy()
+        self._loss, self._renders = 0.0, 0
+
+    def step(self, view: TrainingView, *, with_neighbours: bool) -> npt.NDArray[np.float64]:
+        """One step on ``view``: Eq. 2 on the section alone, and if asked on the section with its neighbours.
+
+        Returns:
+            The gradient [6] of the joint loss with respect to a left twist on the section's own camera pose relative
+            to its neighbours (zero without neighbours): what bundle adjustment of a head descends along.
+        """
+        T_camera_section = se3.inverse(self._section.frames[view.frame_index].T_section_frame)
+        gradients, self._loss = self._loss_gradients(self._splats(), view, T_camera_section, want_means=False)
+        colors, log_radii, opacity_logits = gradients.colors, gradients.log_radii, gradients.opacity_logits
+        pose_gradient = np.zeros(6)
+        weight = self._settings.neighbour_weight
+        if with_neighbours and self._neighbours and weight > 0:
+            joined = joined_splats([self._current(), *self._neighbours], into=self._section)
+            joint, joint_loss = self._loss_gradients(joined, view, T_camera_section, want_means=True)
+            own = self._colors.shape[0]
+            colors = colors + weight * joint.colors[:own]
+            log_radii = log_radii + weight * joint.log_radii[:own]
+            opacity_logits = opacity_logits + weight * joint.opacity_logits[:own]
+            self._loss += weight * joint_loss
+            pose_gradient = _camera_twist_gradient(joined, joint, own, T_camera_section)
+        self._moments.colors.step(self._colors, colors)
+        self._moments.log_radii.step(self._log_radii, log_radii)
+        self._moments.opacity_logits.step(self._opacity_logits, opacity_logits)
+        return pose_gradient
+
+    def move_anchor(self, T_world_section: npt.NDArray[np.float64]) -> None:
+        """Bundle adjustment of a head: the section moves as a whole, its own views see no change."""
+        self._section = replace(self._section, T_world_section=T_world_section)
+
+    def finished(self) -> Optimised:
+        """The section with the attributes reached."""
+        return Optimised(section=self._current(), moments=self._moments, loss=self._loss, renders=self._renders)
+
+    def _splats(self) -> Splats:
+        return Splats(
+            means_m=self._section.means_m,
+            colors=self._colors,
+            log_radii=self._log_radii,
+            opacity_logits=self._opacity_logits,
+        )
+
+    def _current(self) -> Section:
+        gaussians = self._section.gaussians.with_attributes(
+            colors=self._colors, log_radii=self._log_radii, opacity_logits=self._opacity_logits
+        )
+        return replace(self._section, gaussians=gaussians)
+
+    def _loss_gradients(
+        self, splats: Splats, view: TrainingView, T_camera_section: npt.NDArray[np.float64], *, want_means: bool
+    ) -> tuple[Gradients, float]:
+        rendering = self._engine.render(splats, view.frame.camera, T_camera_section)
+        self._renders += 1
+        loss = mapping_loss(
+            rendering.rgb,
+            rendering.depth_m,
+            view.frame.rgb_float(),
+            view.frame.depth_m(),
+            weight_color=self._settings.color_weight,
+            weight_depth=self._settings.depth_weight,
+            ssim_share=self._settings.ssim_share,
+        )
+        gradients = self._engine.backward(rendering, d_rgb=loss.d_rgb, d_depth=loss.d_depth, want_means=want_means)
+        return gradients, loss.loss
+
+
+def _camera_twist_gradient(
+    splats: Splats, gradients: Gradients, first: int, T_camera_section: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Gradient [6] of a left camera twist that moves only the Gaussians from row ``first`` on (the neighbours)."""
+    assert gradients.means_m is not None
+    rotation, translation = T_camera_section[:3, :3], T_camera_section[:3, 3]
+    points = splats.means_m[first:].astype(np.float64) @ rotation.T + translation
+    forces = gradients.means_m[first:].astype(np.float64) @ rotation.T
+    return np.concatenate([forces.sum(axis=0), np.cross(points, forces).sum(axis=0)])

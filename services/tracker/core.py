@@ -1,0 +1,255 @@
+"""The tracker: pose of a frame by rendering view-tied Gaussians and aligning them to it (paper, section 3.3).
+
+Pure: no bus, clock or files. Sections come from a reader the caller passes in.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.geometry import se3
+from vtslam.common.optim.alignment import PosePrior
+from vtslam.common.overlap.selection import CandidateView, overlap_shares, sections_to_pretrack
+from vtslam.common.section import Section
+from vtslam.common.settings import TrackerSettings
+from vtslam.common.splat.engine import Engine
+from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section, world_points_m
+from vtslam.services.tracker.odometry import rgbd_odometry
+from vtslam.services.tracker.optimisers import PoseEstimate, PoseOptimiser, make_optimiser
+from vtslam.services.tracker.state import ExternalPose, TrackerState, TrackingQuality, TrackingState, TrackResult
+
+_MIN_LOSSES = 5  # frames before the usual loss is known
+
+
+class MapReader(Protocol):
+    """What the tracker may ask of the map."""
+
+    def section(self, section_id: int) -> Section:
+        """A section, loaded if it is not in memory."""
+        ...
+
+    def candidate_views(self) -> list[CandidateView]:
+        """All candidate views, in order of time."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tracker:
+    """Settings and engine of the tracker; holds no state of the stream."""
+
+    settings: TrackerSettings
+    engine: Engine
+    threads: int = 1
+
+    def track(
+        self,
+        frame: Frame,
+        map_reader: MapReader,
+        state: TrackerState,
+        *,
+        section_id: int,
+        is_head: bool,
+        guess: npt.NDArray[np.float64] | None = None,
+        prior: ExternalPose | None = None,
+    ) -> TrackResult:
+        """Estimate the pose of ``frame``.
+
+        Args:
+            frame: The frame.
+            map_reader: Sections and candidate views.
+            state: What earlier frames left.
+            section_id: Section the frame belongs to; a head opens it.
+            is_head: Heads are tracked against an earlier, overlapping section S^o; others against their own.
+            guess: ``T_world_camera`` float64 [4,4] to start from; constant velocity if None.
+            prior: A pose from elsewhere, weighed by its covariance.
+
+        Returns:
+            The pose, its covariance, what it rests on and whether to trust it. Never raises on bad sensor data: a
+            frame that cannot be tracked keeps its guess and is called lost.
+        """
+        T_guess = state.constant_velocity_guess() if guess is None else guess
+        usable = self._usable(frame, state)
+        candidates = self._sections_to_try(frame, T_guess, map_reader, section_id, is_head)
+        attempt = self._attempt(frame, usable, candidates, T_guess, section_id, is_head, prior)
+        rescued = False
+        if attempt is not None and self._far_off(attempt.estimate, state) and state.previous_frame is not None:
+            odometry = rgbd_odometry(state.previous_frame, frame)
+            if odometry is not None:
+                again = self._attempt(
+                    frame, usable, candidates, state.committed_poses[-1] @ odometry, section_id, is_head, prior
+                )
+                if again is not None and again.estimate.loss.total < attempt.estimate.loss.total:
+                    attempt, rescued = again, True
+        return self._result(frame, attempt, T_guess, state, is_head=is_head, rescued=rescued)
+
+    def _usable(self, frame: Frame, state: TrackerState) -> npt.NDArray[np.bool_]:
+        """Valid and near pixels; the frame's own mean depth counts for the far filter."""
+        depths = state.with_mean_depth(mean_depth_m(frame))
+        return near_and_valid(frame, far_factor=self.settings.far_factor, largest_mean_depths_m=depths)
+
+    def _sections_to_try(
+        self, frame: Frame, T_guess: npt.NDArray[np.float64], map_reader: MapReader, section_id: int, is_head: bool
+    ) -> list[Section]:
+        """The frame's own section; for heads the earliest overlapping ones (paper, section 3.3)."""
+        if not is_head:
+            own = map_reader.section(section_id)
+            # A head without depth leaves its section empty: the section before it still shows the scene.
+            if own.gaussians.count or section_id == 0:
+                return [own]
+            return [map_reader.section(section_id - 1)]
+        views = [
+            view
+            for view in map_reader.candidate_views()
+            if not (self.settings.overlap.skip_previous and view.section_id == section_id - 1 and not view.is_head)
+        ]
+        points = world_points_m(frame, T_guess, frame.depth > 0)
+        shares = overlap_shares(points, views, self.settings.overlap)
+        ids = sections_to_pretrack(shares, views, head_section_id=section_id, settings=self.settings.overlap)
+        return [map_reader.section(i) for i in ids]
+
+    def _attempt(
+        self,
+        frame: Frame,
+        usable: npt.NDArray[np.bool_],
+        sections: list[Section],
+        T_world_guess: npt.NDArray[np.float64],
+        section_id: int,
+        is_head: bool,
+        prior: ExternalPose | None,
+    ) -> "_Attempt | None":
+        """Pre-track every section, keep the one with the least loss per pixel, and track against it."""
+        mask = usable.astype(np.uint8)
+        tried = []
+        for section in sections:
+            optimiser = self._optimiser(frame, section, section_id == 0, prior)
+            T_guess = se3.inverse(section.T_section_camera(T_world_guess))
+            if len(sections) > 1:
+                estimate = optimiser.pretrack(section.splats, mask, T_guess)
+                tried.append(_Attempt(section, optimiser, estimate, estimate.T_camera_section))
+            else:
+                tried.append(_Attempt(section, optimiser, None, T_guess))
+        if not tried:
+            return None
+        chosen = min(tried, key=lambda a: a.estimate_or_none.loss.total if a.estimate_or_none else 0.0)
+        if is_head and self.settings.visibility:
+            mask = self._with_visibility(frame, usable, chosen)
+        estimate = chosen.optimiser.solve(chosen.section.splats, mask, chosen.T_camera_section)
+        first = chosen.estimate_or_none.first_loss if chosen.estimate_or_none else estimate.first_loss
+        spent = estimate.renders + sum(a.estimate_or_none.renders for a in tried if a.estimate_or_none)
+        estimate = PoseEstimate(
+            T_camera_section=estimate.T_camera_section,
+            covariance=estimate.covariance,
+            first_loss=first,
+            loss=estimate.loss,
+            renders=spent,
+        )
+        return _Attempt(chosen.section, chosen.optimiser, estimate, estimate.T_camera_section)
+
+    def _with_visibility(
+        self, frame: Frame, usable: npt.NDArray[np.bool_], chosen: "_Attempt"
+    ) -> npt.NDArray[np.uint8]:
+        """Usable pixels that the section's frames saw; all usable ones if that leaves too little to track with."""
+        T_world_camera = chosen.section.T_world_section @ se3.inverse(chosen.T_camera_section)
+        visible = usable & visible_in_section(
+            frame, T_world_camera, chosen.section, tolerance=self.settings.visibility_tolerance
+        )
+        enough = visible.mean() > self.settings.weak_covered_share
+        return np.asarray((visible if enough else usable).astype(np.uint8))
+
+    def _optimiser(
+        self, frame: Frame, section: Section, in_first_section: bool, prior: ExternalPose | None
+    ) -> PoseOptimiser:
+        relative = None
+        if prior is not None:
+            relative = PosePrior(
+                T_camera_map=se3.inverse(section.T_section_camera(prior.T_world_camera)),
+                information=np.linalg.inv(prior.covariance),
+            )
+        return make_optimiser(
+            frame,
+            self.engine,
+            self.settings,
+            in_first_section=in_first_section,
+            prior=relative,
+            threads=self.threads,
+        )
+
+    def _far_off(self, estimate: PoseEstimate, state: TrackerState) -> bool:
+        """The 50x rule: loss at the guess far above the median of past losses (method 6.9)."""
+        if len(state.losses) < _MIN_LOSSES:
+            return False
+        usual = np.median(np.array(state.losses), axis=0)
+        first, factor = estimate.first_loss, self.settings.rescue_factor
+        return bool(
+            first.pixels == 0
+            or first.color > factor * max(usual[0], 1e-6)
+            or first.depth_m > factor * max(usual[1], 1e-6)
+        )
+
+    def _result(
+        self,
+        frame: Frame,
+        attempt: "_Attempt | None",
+        T_guess: npt.NDArray[np.float64],
+        state: TrackerState,
+        *,
+        is_head: bool,
+        rescued: bool,
+    ) -> TrackResult:
+        if attempt is None:  # nothing to track against
+            quality = TrackingQuality(
+                color_loss=0.0, depth_loss_m=0.0, covered_share=0.0, renders=0, section_id=-1, rescued=False
+            )
+            return TrackResult(
+                T_world_camera=T_guess,
+                covariance=np.eye(6) * 1e6,
+                quality=quality,
+                state=TrackingState.LOST,
+                overlap_section_id=-1,
+            )
+        estimate, section = attempt.estimate, attempt.section
+        share = estimate.loss.pixels / (frame.camera.width * frame.camera.height)
+        verdict = self._state(estimate, share, state)
+        T_world_camera = section.T_world_section @ se3.inverse(estimate.T_camera_section)
+        return TrackResult(
+            T_world_camera=T_guess if verdict is TrackingState.LOST else se3.orthonormalized(T_world_camera),
+            covariance=estimate.covariance,
+            quality=TrackingQuality(
+                color_loss=estimate.loss.color,
+                depth_loss_m=estimate.loss.depth_m,
+                covered_share=share,
+                renders=estimate.renders,
+                section_id=section.section_id,
+                rescued=rescued,
+            ),
+            state=verdict,
+            overlap_section_id=section.section_id if is_head else -1,
+        )
+
+    def _state(self, estimate: PoseEstimate, covered_share: float, state: TrackerState) -> TrackingState:
+        if covered_share < self.settings.lost_covered_share:
+            return TrackingState.LOST
+        if len(state.losses) >= _MIN_LOSSES:
+            usual = np.median(np.array(state.losses), axis=0)
+            worst = max(estimate.loss.color / max(usual[0], 1e-3), estimate.loss.depth_m / max(usual[1], 1e-3))
+            if worst > self.settings.lost_loss_factor:
+                return TrackingState.LOST
+        return TrackingState.WEAK if covered_share < self.settings.weak_covered_share else TrackingState.OK
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """A section, its optimiser, and what it found so far."""
+
+    section: Section
+    optimiser: PoseOptimiser
+    estimate_or_none: PoseEstimate | None
+    T_camera_section: npt.NDArray[np.float64]
+
+    @property
+    def estimate(self) -> PoseEstimate:
+        assert self.estimate_or_none is not None
+        return self.estimate_or_none

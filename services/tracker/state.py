@@ -1,0 +1,113 @@
+"""What the tracker carries from frame to frame, and what it says of a frame."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.frame import Frame
+from vtslam.common.geometry import se3
+
+_HISTORY_FRAMES = 200  # losses remembered: enough for a stable median, bounded on endless streams
+_FAR_SAMPLES = 30  # largest mean depths kept for the far filter (method)
+
+
+class TrackingState(Enum):
+    """How far a pose can be trusted."""
+
+    OK = "ok"
+    WEAK = "weak"  # few usable pixels
+    LOST = "lost"  # no usable pixels, or the map does not agree with the frame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackingQuality:
+    """Facts about one estimated pose.
+
+    Attributes:
+        color_loss: Mean over the mask of sum_c |I - I'| at the last render.
+        depth_loss_m: Mean over the mask of |D - D'| at the last render.
+        covered_share: Pixels in the mask over all pixels.
+        renders: Renders spent.
+        section_id: The section it was tracked against; -1 if none.
+        rescued: Whether RGB-D odometry replaced the guess.
+    """
+
+    color_loss: float
+    depth_loss_m: float
+    covered_share: float
+    renders: int
+    section_id: int
+    rescued: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackResult:
+    """Pose of one frame.
+
+    Attributes:
+        T_world_camera: float64 [4,4].
+        covariance: float64 [6,6] of a left twist on ``T_camera_world`` (translation m, rotation rad).
+        quality: What it rests on.
+        state: Whether to trust it.
+        overlap_section_id: For heads, the section S^o it was tracked against; -1 otherwise.
+    """
+
+    T_world_camera: npt.NDArray[np.float64]
+    covariance: npt.NDArray[np.float64]
+    quality: TrackingQuality
+    state: TrackingState
+    overlap_section_id: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ExternalPose:
+    """A pose from another sensor: float64 [4,4] and the covariance [6,6] of a left twist on ``T_camera_world``."""
+
+    T_world_camera: npt.NDArray[np.float64]
+    covariance: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackerState:
+    """All that crosses a frame boundary in the tracker; a restarted tracker needs nothing else.
+
+    Attributes:
+        committed_poses: The last two committed ``T_world_camera``, older first.
+        previous_frame: The last frame, for odometry.
+        losses: (colour, depth) losses of past frames, newest last, bounded.
+        largest_mean_depths_m: The largest per-frame mean depths, descending, bounded.
+    """
+
+    committed_poses: tuple[npt.NDArray[np.float64], ...] = ()
+    previous_frame: Frame | None = None
+    losses: tuple[tuple[float, float], ...] = ()
+    largest_mean_depths_m: tuple[float, ...] = ()
+
+    def constant_velocity_guess(self) -> npt.NDArray[np.float64]:
+        """T_t = T_{t-1} T_{t-2}^-1 T_{t-1}; the last pose if there is only one, the identity if there is none."""
+        if not self.committed_poses:
+            return np.eye(4)
+        if len(self.committed_poses) == 1:
+            return self.committed_poses[-1]
+        older, newer = self.committed_poses
+        return se3.orthonormalized(newer @ se3.inverse(older) @ newer)
+
+    def with_mean_depth(self, mean_depth_m: float) -> tuple[float, ...]:
+        """The far filter's samples with one more."""
+        return tuple(sorted((*self.largest_mean_depths_m, mean_depth_m), reverse=True)[:_FAR_SAMPLES])
+
+    def after(
+        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], result: TrackResult | None, mean_depth_m: float
+    ) -> "TrackerState":
+        """The state once ``frame`` is committed at ``T_world_camera``."""
+        losses = self.losses
+        if result is not None and result.state is TrackingState.OK:
+            losses = (*losses, (result.quality.color_loss, result.quality.depth_loss_m))[-_HISTORY_FRAMES:]
+        return TrackerState(
+            committed_poses=(*self.committed_poses, T_world_camera)[-2:],
+            previous_frame=frame,
+            losses=losses,
+            largest_mean_depths_m=self.with_mean_depth(mean_depth_m) if mean_depth_m > 0 else self.largest_mean_depths_m,
+        )
