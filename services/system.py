@@ -1,6 +1,7 @@
 """The whole system in one process: frames in, poses and sections out. The cores are those of the fleet's processes."""
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -35,13 +36,22 @@ class Archive(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameReport:
-    """What happened to one frame: tracking (None for the first frame), mapping, and the section it sealed."""
+    """What happened to one frame: tracking (None for the first frame), mapping, and the section it sealed.
+
+    Attributes:
+        frame, tracking, commit: See above.
+        sealed_section_id: The section that the frame ended, or None.
+        seal_renders: Renders spent on ending it.
+        track_s, map_s: Seconds of tracking, and of mapping with ending the section; 0 without a clock.
+    """
 
     frame: Frame
     tracking: TrackResult | None
     commit: CommitRecord
     sealed_section_id: int | None
     seal_renders: int
+    track_s: float
+    map_s: float
 
 
 class SectionMap:
@@ -97,10 +107,27 @@ class SectionMap:
 
 
 class System:
-    """Tracker and mapper taking turns (lockstep), one frame at a time."""
+    """Tracker and mapper taking turns (lockstep), one frame at a time.
 
-    def __init__(self, settings: Settings, engine: Engine, archive: Archive, *, threads: int) -> None:
+    Args:
+        settings: The effective settings.
+        engine: The rasteriser.
+        archive: Where sealed sections go and come from.
+        threads: Threads of the tracker's alignment.
+        clock: Seconds, for the times in `FrameReport`; nothing else depends on it.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        engine: Engine,
+        archive: Archive,
+        *,
+        threads: int,
+        clock: Callable[[], float] = lambda: 0.0,
+    ) -> None:
         self.settings = settings
+        self._clock = clock
         self.map = SectionMap(archive, candidate_interval=settings.section.candidate_interval)
         self._tracker = Tracker(settings=settings.tracker, engine=engine, threads=threads)
         self._mapper = Mapper(
@@ -112,28 +139,31 @@ class System:
     def process(self, frame: Frame, *, prior: ExternalPose | None = None) -> FrameReport:
         """Track and map the next frame; seals its section if it is the last of it."""
         section_id, row = divmod(self._frames, self.settings.section.length)
-        tracking = None
+        tracking, start_s = None, self._clock()
         if self._frames > 0:
             tracking = self._tracker.track(
                 frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=prior
             )
         T_world_camera = self._first_pose(prior) if tracking is None else tracking.T_world_camera
+        tracked_s = self._clock()
         active, commit = self._map(frame, T_world_camera, section_id, row)
         self.map.committed(active)
         self._state = self._state.after(frame, commit.T_world_camera, tracking, mean_depth_m(frame))
         self._frames += 1
         sealed, renders = (section_id, self._seal()) if row == self.settings.section.length - 1 else (None, 0)
         return FrameReport(
-            frame=frame, tracking=tracking, commit=commit, sealed_section_id=sealed, seal_renders=renders
+            frame=frame,
+            tracking=tracking,
+            commit=commit,
+            sealed_section_id=sealed,
+            seal_renders=renders,
+            track_s=tracked_s - start_s,
+            map_s=self._clock() - tracked_s,
         )
 
-    def finish(self) -> int | None:
-        """Seal the section that is still open, if any; returns its id."""
-        if self.map.active is None:
-            return None
-        section_id = self.map.active.section.section_id
-        self._seal()
-        return section_id
+    def finish(self) -> int:
+        """Seal the section that is still open, if any; returns the renders spent."""
+        return 0 if self.map.active is None else self._seal()
 
     @staticmethod
     def _first_pose(prior: ExternalPose | None) -> npt.NDArray[np.float64]:
