@@ -44,6 +44,10 @@ def test_resize_is_that_of_the_frame(recording: ReplicaRecording) -> None:
     np.testing.assert_array_equal(_poses(small.ground_truth()), _poses(whole.ground_truth()))
 
 
+def test_resize_to_the_same_size_changes_nothing(recording: ReplicaRecording) -> None:
+    assert open_source(recording.uri, size=(48, 36)).uri == open_source(recording.uri).uri
+
+
 def test_range_counts_from_zero_and_cuts_ground_truth(recording: ReplicaRecording) -> None:
     whole, part = open_source(recording.uri), open_source(recording.uri, frames=(2, 4))
     assert len(part) == 2
@@ -52,7 +56,7 @@ def test_range_counts_from_zero_and_cuts_ground_truth(recording: ReplicaRecordin
         assert frame.frame_id == index
         assert frame.capture_time_ns == expected.capture_time_ns
         np.testing.assert_array_equal(frame.rgb, expected.rgb)
-    np.testing.assert_array_equal(_poses(part.ground_truth()), recording_poses(whole.ground_truth())[2:4])
+    np.testing.assert_array_equal(_poses(part.ground_truth()), _poses(whole.ground_truth())[2:4])
     assert (part.camera, part.family, part.depth_scale_m) == (whole.camera, whole.family, whole.depth_scale_m)
 
 
@@ -102,10 +106,6 @@ def test_opening_again_with_the_same_arguments(recording: ReplicaRecording) -> N
 def test_overrides_replace_options(recording: ReplicaRecording) -> None:
     source = open_source(f"{recording.uri}?fx=50&fy=60", overrides={"fx": "70"})
     assert (source.camera.fx, source.camera.fy) == (70.0, 60.0)
-
-
-def recording_poses(poses: object) -> np.ndarray:
-    return _poses(poses)
 
 
 def _poses(poses: object) -> np.ndarray:

@@ -141,6 +141,8 @@ def _resized(source: Source, size: Size) -> Source:
     width, height = size
     if width < 1 or height < 1:
         raise SourceError(f"size: expected a positive width and height, found {width}x{height}")
+    if size == (source.camera.width, source.camera.height):
+        return source
     uri = _with_option(source.uri, "size", f"{width}x{height}")
     return _Resized(inner=source, uri=uri, camera=source.camera.resized(width, height))
 
