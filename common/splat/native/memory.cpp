@@ -1,0 +1,90 @@
+#include "memory.hpp"
+
+#include <pthread.h>
+
+#include <bit>
+#include <cstdlib>
+#include <mutex>
+#include <new>
+#include <vector>
+
+namespace vtslam::native {
+namespace {
+
+constexpr std::size_t kHeader = 64;  // holds the block's capacity, keeps the alignment
+constexpr std::size_t kKeptBytes = std::size_t(256) << 20;
+
+struct Cache {
+  std::mutex mutex;
+  std::vector<void*> blocks;  // oldest first
+  std::size_t bytes = 0;
+};
+
+Cache* cache = nullptr;
+std::once_flag once;
+
+Cache& the_cache() {
+  std::call_once(once, [] {
+    cache = new Cache;
+    // A forked child may inherit the mutex in any state: it starts anew and leaves the parent's blocks alone.
+    pthread_atfork(nullptr, nullptr, [] { cache = new Cache; });
+  });
+  return *cache;
+}
+
+std::size_t& capacity_of(void* block) { return *reinterpret_cast<std::size_t*>(static_cast<char*>(block) - kHeader); }
+
+void free_block(void* block) { std::free(static_cast<char*>(block) - kHeader); }
+
+// Rounded up to an eighth of a power of two, so that sizes that vary a little share blocks.
+std::size_t size_class(std::size_t bytes) {
+  const std::size_t step = std::max<std::size_t>(4096, std::bit_floor(bytes) / 8);
+  return (bytes + step - 1) / step * step;
+}
+
+}  // namespace
+
+void* acquire_block(std::size_t bytes) {
+  const std::size_t capacity = size_class(bytes);
+  Cache& kept = the_cache();
+  {
+    const std::lock_guard lock(kept.mutex);
+    for (std::size_t i = kept.blocks.size(); i-- > 0;) {
+      void* block = kept.blocks[i];
+      if (capacity_of(block) != capacity) continue;
+      kept.blocks.erase(kept.blocks.begin() + static_cast<std::ptrdiff_t>(i));
+      kept.bytes -= capacity;
+      return block;
+    }
+  }
+  void* memory = std::aligned_alloc(64, capacity + kHeader);
+  if (memory == nullptr) throw std::bad_alloc();
+  void* block = static_cast<char*>(memory) + kHeader;
+  capacity_of(block) = capacity;
+  return block;
+}
+
+void release_block(void* block) noexcept {
+  if (block == nullptr) return;
+  Cache& kept = the_cache();
+  const std::lock_guard lock(kept.mutex);
+  const std::size_t capacity = capacity_of(block);
+  if (capacity > kKeptBytes / 4) {
+    free_block(block);
+    return;
+  }
+  try {
+    kept.blocks.push_back(block);
+  } catch (const std::bad_alloc&) {
+    free_block(block);
+    return;
+  }
+  kept.bytes += capacity;
+  while (kept.bytes > kKeptBytes) {
+    kept.bytes -= capacity_of(kept.blocks.front());
+    free_block(kept.blocks.front());
+    kept.blocks.erase(kept.blocks.begin());
+  }
+}
+
+}  // namespace vtslam::native
