@@ -24,6 +24,10 @@ class RunFacts:
         width, height: Size of the images as mapped, pixels.
         first_frame, end_frame: The part of the source, from 0, its end not included.
         finished: The run came to its end; False while it is under way, and after it was cut off.
+        interrupted: It was asked to stop early, and kept what was done.
+        frames: Frames committed so far.
+        seconds: Wall-clock time of the run, reading and writing included.
+        peak_rss_mb: Largest resident memory of the process, 10^6 bytes.
     """
 
     created_by: str
@@ -35,6 +39,10 @@ class RunFacts:
     first_frame: Annotated[int, Range(0)]
     end_frame: Annotated[int, Range(0)]
     finished: bool = False
+    interrupted: bool = False
+    frames: Annotated[int, Range(0)] = 0
+    seconds: Annotated[float, Range(0.0)] = 0.0
+    peak_rss_mb: Annotated[float, Range(0.0)] = 0.0
 
     def __post_init__(self) -> None:
         if self.end_frame < self.first_frame:

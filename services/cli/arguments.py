@@ -1,0 +1,119 @@
+"""The arguments of all commands; imports nothing that is slow, so that ``--help`` answers at once."""
+
+import argparse
+from pathlib import Path
+
+SOURCE_HELP = "where frames come from: replica:DIR, 7scenes:DIR, sim:room"
+_JSON_HELP = "write the result as JSON (- for standard output)"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of ``vtslam``; the parsed ``command`` names the command."""
+    top = argparse.ArgumentParser(
+        prog="vtslam",
+        description="RGB-D SLAM by splatting view-tied 3D Gaussians.",
+        epilog="first steps: vtslam demo",
+    )
+    top.add_argument("--version", action="store_true", help="print the version and end")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND")
+    _add_demo(commands)
+    _add_run(commands)
+    _add_eval(commands)
+    _add_settings(commands)
+    _add_doctor(commands)
+    return top
+
+
+_Commands = argparse._SubParsersAction  # argparse has no public name for it
+
+
+def _command(
+    commands: "_Commands[argparse.ArgumentParser]", name: str, text: str, *, example: str
+) -> argparse.ArgumentParser:
+    return commands.add_parser(
+        name,
+        help=text,
+        description=text[0].upper() + text[1:] + ".",
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _add_demo(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "demo",
+        "map a simulated room, judge the result, and draw it",
+        example="vtslam demo --out /tmp/demo --set source.noise=kinect",
+    )
+    command.add_argument("--out", type=Path, default=Path("vtslam-demo"), help="run folder (default: %(default)s)")
+    _add_assignments(command)
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "run",
+        "track and map a recording",
+        example="vtslam run replica:DIR --in-process --size 320x240 --frames 0:120 --out RUN",
+    )
+    command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    command.add_argument("--in-process", action="store_true", help="run in this process; for now the only way")
+    command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
+    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    _add_layers(command)
+    command.add_argument("--size", metavar="WxH", help="scale frames to this size (source.size)")
+    command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only (source.frames)")
+    command.add_argument(
+        "--holdout", type=int, metavar="K", help="track every K-th regular frame but keep it out of mapping (holdout)"
+    )
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_eval(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands, "eval", "judge a run against its recording; writes RUN/metrics.json", example="vtslam eval RUN"
+    )
+    command.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_settings(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "settings",
+        "list all settings: effective value, type, range",
+        example="vtslam settings --preset paper --family replica",
+    )
+    _add_layers(command)
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_doctor(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(commands, "doctor", "check the installation and this machine", example="vtslam doctor")
+    command.add_argument("--gpu", action="store_true", help="check the CUDA engine against the reference instead")
+
+
+def _add_layers(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--preset", default="fast", metavar="P", help="schedule: fast, paper, released, realtime (default: %(default)s)"
+    )
+    command.add_argument(
+        "--family",
+        metavar="F",
+        help="kind of recording: tum, replica, scannet, scannetpp, kitti (default: as the source says)",
+    )
+    command.add_argument("--config", type=Path, metavar="FILE", help="TOML file of settings")
+    _add_assignments(command)
+
+
+def _add_assignments(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--set",
+        dest="assignments",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="one setting, as in section.length=20; may be repeated (all keys: vtslam settings)",
+    )

@@ -1,0 +1,41 @@
+"""Commands by name; each is imported when it is asked for."""
+
+import sys
+from argparse import Namespace
+
+from vtslam.common.config import ConfigError
+from vtslam.common.trajectory_io import TrajectoryError
+from vtslam.services.sensor.sources.base import SourceError
+from vtslam.storage.errors import StorageError
+
+_FAILED, _USAGE = 1, 2
+
+
+def execute(args: Namespace) -> int:
+    """Run the command that ``args`` name; what the user can put right is one line on standard error."""
+    try:
+        return _command(args)
+    except ConfigError as error:
+        return _refused(error, _USAGE)
+    except (SourceError, StorageError, TrajectoryError) as error:
+        return _refused(error, _FAILED)
+    except BrokenPipeError:
+        return _FAILED  # the reader of our output is gone: nobody to tell
+
+
+def _command(args: Namespace) -> int:
+    match args.command:
+        case "run":
+            from vtslam.services.cli.run_command import run_command
+
+            return run_command(args)
+        case "eval":
+            from vtslam.services.cli.eval_command import eval_command
+
+            return eval_command(args)
+    raise AssertionError(f"no command {args.command}")
+
+
+def _refused(error: Exception, status: int) -> int:
+    print(f"vtslam: {error}", file=sys.stderr)
+    return status

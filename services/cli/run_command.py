@@ -1,0 +1,59 @@
+"""``vtslam run``: track and map a recording."""
+
+from argparse import Namespace
+from dataclasses import asdict
+from pathlib import Path
+
+from vtslam.common.config import ConfigError
+from vtslam.services.cli.console import Console, Progress
+from vtslam.services.cli.frame_watch import FrameWatch
+from vtslam.services.cli.stop_request import StopRequest
+from vtslam.services.recording_run import RunSummary
+from vtslam.services.run_plan import RunPlan, plan_run
+
+
+def run_command(args: Namespace) -> int:
+    """Run as the arguments say; the exit status."""
+    if not args.in_process:
+        raise ConfigError("run: add --in-process; running as separate processes is not available")
+    console = Console(args.json)
+    plan = plan_run(
+        args.source, preset=args.preset, family=args.family, config=args.config, assignments=_assignments(args)
+    )
+    console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
+    with StopRequest() as stop:
+        summary = watched_run(plan, args.out, stop, overwrite=args.overwrite)
+    console.print(summary_text(summary, args.out))
+    console.result({"run": str(args.out.resolve()), "source": plan.source.uri, **asdict(summary)})
+    return stop.exit_status if summary.interrupted else 0
+
+
+def watched_run(
+    plan: RunPlan, out: Path, stop: StopRequest, *, overwrite: bool, created_by: str | None = None
+) -> RunSummary:
+    """Execute a plan with progress and lines about lost tracking."""
+    with Progress(len(plan.source), what="mapping", unit="frame") as progress:
+        return plan.execute(
+            out, overwrite=overwrite, created_by=created_by, on_frame=FrameWatch(progress), should_stop=stop
+        )
+
+
+def summary_text(summary: RunSummary, out: Path) -> str:
+    """The end of a run in words."""
+    rate = summary.frames / summary.seconds if summary.seconds > 0 else 0.0
+    lines = [
+        f"{summary.frames} frames in {summary.seconds:.1f} s ({rate:.2f} frames/s): {summary.sections} sections, "
+        f"{summary.gaussians} Gaussians, peak memory {summary.peak_rss_mb:.0f} MB"
+    ]
+    if summary.weak or summary.lost:
+        lines.append(f"tracking was weak on {summary.weak} frames and lost on {summary.lost}")
+    if summary.interrupted:
+        lines.append("stopped early; what was done is kept")
+    lines.append(f"run folder: {out}   (next: vtslam eval {out})")
+    return "\n".join(lines)
+
+
+def _assignments(args: Namespace) -> list[str]:
+    """``--set`` texts, and those that the short options stand for."""
+    shorthands = {"source.size": args.size, "source.frames": args.frames, "holdout": args.holdout}
+    return [*args.assignments, *(f"{key}={value}" for key, value in shorthands.items() if value is not None)]

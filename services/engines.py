@@ -1,0 +1,39 @@
+"""The rasteriser that the settings ask for; an engine is imported only when it is chosen."""
+
+import os
+
+from vtslam.common.config import ConfigError
+from vtslam.common.settings import SplatSettings
+from vtslam.common.splat.engine import Engine, RasterSettings
+
+
+def thread_count(settings: SplatSettings) -> int:
+    """Threads of the CPU engine: as set, or one per core that this process may use."""
+    return settings.threads or len(os.sched_getaffinity(0))
+
+
+def make_engine(settings: SplatSettings) -> Engine:
+    """The engine of ``settings``.
+
+    Raises:
+        ConfigError: The engine is not installed, has no device, or cannot do what the settings ask for.
+    """
+    raster = RasterSettings(low_pass_px2=settings.low_pass_px2, near_m=settings.near_m, alpha_cap=settings.alpha_cap)
+    try:
+        return _made(settings, raster)
+    except (ImportError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"splat.engine = {settings.engine}: {error}") from error
+
+
+def _made(settings: SplatSettings, raster: RasterSettings) -> Engine:
+    if settings.engine == "gsplat":
+        from vtslam.common.splat.gsplat_engine import GsplatEngine
+
+        return GsplatEngine(raster)
+    if settings.engine == "reference":
+        from vtslam.common.splat.reference import ReferenceEngine
+
+        return ReferenceEngine(raster)
+    from vtslam.common.splat.native_engine import NativeEngine
+
+    return NativeEngine(raster, threads=thread_count(settings))

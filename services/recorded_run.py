@@ -1,0 +1,112 @@
+"""A run folder opened again together with its source: sections, poses and renderings of its frames."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.config import load
+from vtslam.common.frame import Frame
+from vtslam.common.geometry import se3
+from vtslam.common.section import Section
+from vtslam.common.settings import Settings
+from vtslam.common.splat.engine import Rendering
+from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.engines import make_engine
+from vtslam.services.sensor.sources.registry import open_source
+from vtslam.storage.errors import RunFolderError
+from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.section_convert import SectionArchive
+
+
+class RecordedRun:
+    """What a run left, read back; sections are loaded one by one, so memory does not grow with the run.
+
+    Args:
+        path: The run folder.
+
+    Attributes:
+        folder: The run folder, open for reading.
+        info: What the run was made with.
+        settings: Its effective settings.
+        source: Its recording, opened again.
+        rows: The facts per frame (``frames.jsonl``).
+        poses: float64 [F,4,4], the committed ``T_world_camera`` of frames 0 to F-1.
+
+    Raises:
+        StorageError: There is no run, or it cannot be read.
+        TrajectoryError: Its trajectory cannot be read.
+        ConfigError: Its settings are refused, or its engine is not there.
+        SourceError: Its source cannot be opened any more.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.folder = RunFolder.open(path)
+        self.info = self.folder.read_info()
+        self.settings: Settings = load(Settings, [(f"{path / 'run.toml'} [settings]", self.info.settings)])
+        self.source = open_source(self.info.facts.source)
+        self._engine = make_engine(self.settings.splat)
+        self._archive = SectionArchive(self.folder)
+        self.rows: list[dict[str, Any]] = self.folder.read_frames()
+        self.poses = read_trajectory(self.folder.trajectory_path).poses
+        self._check()
+        self._frames_of = _ranges([row["section_id"] for row in self.rows])
+
+    @property
+    def num_frames(self) -> int:
+        """Frames that were committed."""
+        return len(self.rows)
+
+    def section(self, section_id: int) -> Section:
+        """A section from disk."""
+        return self._archive.read(section_id)
+
+    def section_ids(self) -> list[int]:
+        """Ids of the sections, in order."""
+        return self.folder.section_ids()
+
+    def frames_of(self, section_id: int) -> range:
+        """The committed frames of a section, which are consecutive; empty for a section that there is not."""
+        return self._frames_of.get(section_id, range(0))
+
+    def frame(self, frame_id: int) -> Frame:
+        """A frame of the recording."""
+        return self.source.frame(frame_id)
+
+    def render(self, section: Section, frame_id: int) -> Rendering:
+        """``section`` as the camera of frame ``frame_id`` sees it from the frame's committed pose."""
+        T_camera_section = se3.inverse(section.T_section_camera(self.poses[frame_id]))
+        return self._engine.render(section.splats, section.camera, T_camera_section)
+
+    def true_poses(self) -> npt.NDArray[np.float64] | None:
+        """True ``T_world_camera`` [F,4,4] of the committed frames, or None."""
+        truth = self.source.ground_truth()
+        return None if truth is None else truth[: self.num_frames]
+
+    def _check(self) -> None:
+        facts = self.info.facts
+        size = (self.source.camera.width, self.source.camera.height)
+        if size != (facts.width, facts.height) or len(self.source) != facts.end_frame:
+            raise RunFolderError(
+                f"{self.folder.path}: {facts.source}: expected the {facts.end_frame} frames of "
+                f"{facts.width}x{facts.height} that the run was made from, found {len(self.source)} of "
+                f"{size[0]}x{size[1]}"
+            )
+        if len(self.poses) != len(self.rows):
+            raise RunFolderError(
+                f"{self.folder.path}: expected as many poses as frames, found {len(self.poses)} poses in "
+                f"{self.folder.trajectory_path.name} and {len(self.rows)} frames in frames.jsonl"
+            )
+        if not self.rows:
+            raise RunFolderError(f"{self.folder.path}: no frame was committed; nothing to evaluate")
+        if [row.get("frame_id") for row in self.rows] != list(range(len(self.rows))):
+            raise RunFolderError(f"{self.folder.path}: frames.jsonl: expected frames 0, 1, 2, ... in order")
+
+
+def _ranges(section_ids: list[int]) -> dict[int, range]:
+    """Where each section begins and ends, given the section of every frame."""
+    out: dict[int, range] = {}
+    for frame_id, section_id in enumerate(section_ids):
+        out[section_id] = range(out[section_id].start if section_id in out else frame_id, frame_id + 1)
+    return out

@@ -1,0 +1,114 @@
+"""A run before it starts: source, settings and engine, all checked, so that nothing is refused half-way."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vtslam.common.config import to_dict
+from vtslam.common.preset_loading import load_settings
+from vtslam.common.settings import Settings, SourceSettings
+from vtslam.common.splat.engine import Engine
+from vtslam.services.engines import make_engine
+from vtslam.services.process_facts import program_version, versions
+from vtslam.services.recording_run import FrameFacts, RunSummary, run_recording
+from vtslam.services.sensor.sources.base import Source
+from vtslam.services.sensor.sources.registry import open_source
+from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.run_info import RunFacts, RunInfo
+
+DEFAULT_PRESET = "fast"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunPlan:
+    """Everything a run needs but its folder.
+
+    Attributes:
+        source: The open recording, at the size and over the frames that the settings ask for.
+        settings: The effective settings.
+        engine: The rasteriser.
+        preset, family: Names of the settings' layers.
+    """
+
+    source: Source
+    settings: Settings
+    engine: Engine
+    preset: str
+    family: str
+
+    def execute(
+        self,
+        folder: Path,
+        *,
+        overwrite: bool = False,
+        created_by: str | None = None,
+        on_frame: Callable[[FrameFacts], None] = lambda facts: None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> RunSummary:
+        """Make the run folder and run; see :func:`vtslam.services.recording_run.run_recording`.
+
+        Args:
+            folder: Where the run folder is made.
+            overwrite: Give up an earlier run there.
+            created_by: Program and version for ``run.toml``; this program if None.
+            on_frame: Called after each frame.
+            should_stop: Asked before each frame.
+
+        Raises:
+            StorageError: The folder cannot be made or written.
+            SourceError: A frame cannot be read; what was done before it is kept.
+        """
+        with RunFolder.create(folder, self._info(created_by), overwrite=overwrite) as run:
+            return run_recording(
+                self.source, self.settings, self.engine, run, on_frame=on_frame, should_stop=should_stop
+            )
+
+    def _info(self, created_by: str | None) -> RunInfo:
+        facts = RunFacts(
+            created_by=created_by or f"vtslam {program_version()}",
+            source=self.source.uri,
+            family=self.family,
+            preset=self.preset,
+            width=self.source.camera.width,
+            height=self.source.camera.height,
+            first_frame=0,
+            end_frame=len(self.source),
+        )
+        return RunInfo(facts=facts, settings=to_dict(self.settings), versions=versions())
+
+
+def plan_run(
+    uri: str,
+    *,
+    preset: str = DEFAULT_PRESET,
+    family: str | None = None,
+    config: Path | None = None,
+    assignments: Sequence[str] = (),
+) -> RunPlan:
+    """Check settings, open the source and make the engine.
+
+    Args:
+        uri: The source, as in ``replica:DIR`` or ``sim:room``.
+        preset: Schedule (`vtslam.common.preset_loading.SCHEDULES`).
+        family: Kind of recording; None takes what the source says of itself.
+        config: A user's TOML file, or None.
+        assignments: ``key=value`` texts.
+
+    Raises:
+        ConfigError: A setting is refused.
+        SourceError: The source cannot be opened, or has no such option, size or range.
+    """
+    # The source's own family is known once it is open, and how to open it is a setting, which families leave alone.
+    settings = load_settings(preset=preset, family=family or "tum", file=config, assignments=assignments)
+    source = open_source(uri, overrides=_source_options(settings.source))
+    family = family or source.family
+    settings = load_settings(preset=preset, family=family, file=config, assignments=assignments)
+    return RunPlan(source=source, settings=settings, engine=make_engine(settings.splat), preset=preset, family=family)
+
+
+def _source_options(settings: SourceSettings) -> dict[str, str]:
+    """The options of a source's URI that the settings ask for."""
+    options = {"size": settings.size, "range": settings.frames, "noise": settings.noise}
+    if settings.seed >= 0:
+        options["seed"] = str(settings.seed)
+    return {key: value for key, value in options.items() if value}

@@ -1,0 +1,83 @@
+"""Sections of the map as section files keep them, and back: nothing is lost, positions are computed anew."""
+
+import numpy as np
+
+from vtslam.common.gaussians import ViewTiedGaussians
+from vtslam.common.section import Section, SectionFrame
+from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.section_record import SectionRecord
+
+
+def record_of(section: Section) -> SectionRecord:
+    """The record of a sealed section with at least one frame."""
+    views = [row for row, frame in enumerate(section.frames) if frame.view_depth is not None]
+    size = (section.camera.height, section.camera.width)
+    view_depth = [frame.view_depth for frame in section.frames if frame.view_depth is not None]
+    gaussians = section.gaussians
+    return SectionRecord(
+        section_id=section.section_id,
+        camera=section.camera,
+        depth_scale_m=section.depth_scale_m,
+        depth_factor=section.depth_factor,
+        T_world_section=section.T_world_section,
+        frame_ids=np.array([frame.frame_id for frame in section.frames], np.int64),
+        capture_times_ns=np.array([frame.capture_time_ns for frame in section.frames], np.int64),
+        T_section_frame=np.stack([frame.T_section_frame for frame in section.frames]),
+        frame_index=gaussians.frame_index,
+        pixel=gaussians.pixel,
+        subpixel=gaussians.subpixel,
+        depth=gaussians.depth,
+        color=gaussians.colors,
+        log_radius=gaussians.log_radii,
+        opacity_logit=gaussians.opacity_logits,
+        view_index=np.array(views, np.uint16),
+        view_depth=np.stack(view_depth) if view_depth else np.zeros((0, *size), np.uint16),
+    )
+
+
+def section_of(record: SectionRecord) -> Section:
+    """The section of a record, its Gaussians' positions computed from its frames' poses."""
+    row_of_view = {int(row): index for index, row in enumerate(record.view_index)}
+    frames = tuple(
+        SectionFrame(
+            frame_id=int(record.frame_ids[row]),
+            capture_time_ns=int(record.capture_times_ns[row]),
+            T_section_frame=record.T_section_frame[row],
+            view_depth=record.view_depth[row_of_view[row]] if row in row_of_view else None,
+        )
+        for row in range(record.num_frames)
+    )
+    gaussians = ViewTiedGaussians(
+        frame_index=record.frame_index,
+        pixel=record.pixel,
+        subpixel=record.subpixel,
+        depth=record.depth,
+        colors=record.color,
+        log_radii=record.log_radius,
+        opacity_logits=record.opacity_logit,
+    )
+    return Section(
+        section_id=record.section_id,
+        T_world_section=record.T_world_section,
+        camera=record.camera,
+        depth_scale_m=record.depth_scale_m,
+        depth_factor=record.depth_factor,
+        frames=frames,
+        gaussians=gaussians,
+        means_m=np.zeros((0, 3), np.float32),
+    ).retied()
+
+
+class SectionArchive:
+    """Sealed sections in a run folder."""
+
+    def __init__(self, run: RunFolder) -> None:
+        self._run = run
+
+    def write(self, section: Section) -> None:
+        """Keep a sealed section, durable and verified; raises StorageError."""
+        self._run.write_section(record_of(section))
+
+    def read(self, section_id: int) -> Section:
+        """A section written before; raises StorageError."""
+        return section_of(self._run.read_section(section_id))
