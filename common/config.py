@@ -30,7 +30,6 @@ from vtslam.common.config_hints import (
     SCALAR_TEXT,
     Range,
     default_of,
-    expected_text,
     nested_class,
     optional_part,
     range_text,
@@ -175,13 +174,14 @@ def _field_value(key: str, hint: Any, default: Any, given: Sequence[tuple[str, A
     if nested is not None:
         return _nested_value(key, nested, optional, default, given, known_keys)
     if default is dataclasses.MISSING and not given:
-        raise ConfigError(f"settings: {key}: no value given; expected {expected_text(hint)}")
+        raise ConfigError(f"settings: {key}: no value given; expected {type_text(hint, with_range=True)}")
     value = default
     for origin, found in given:
         try:
             value = _checked(hint, found, None)
         except ValueError as error:
-            raise ConfigError(f"{origin}: {key} = {value_text(found)}: {error}") from error
+            expected = type_text(hint, with_range=True) + _like_choice(hint, found)
+            raise ConfigError(f"{origin}: {key} = {value_text(found)}: expected {expected}") from error
     return value
 
 
@@ -214,17 +214,17 @@ def _nested_value(
 
 
 def _checked(hint: Any, value: Any, bounds: Range | None) -> Any:  # noqa: ANN401
-    """``value`` as the type of ``hint``; ValueError says what is expected."""
+    """``value`` as the type of ``hint``; ValueError if it is something else."""
     hint, bounds = without_bounds(hint, bounds)
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
         return None if _is_none(value) else _checked(optional_part(hint), value, bounds)
     if origin is Literal:
         if not any(type(choice) is type(value) and choice == value for choice in get_args(hint)):
-            raise ValueError(f"expected {type_text(hint)}{_hint_of_choice(value, get_args(hint))}")
+            raise ValueError("not one of the choices")
         return value
     if origin is tuple:
-        return _checked_tuple(hint, value, bounds)
+        return _checked_tuple(get_args(hint), value, bounds)
     return _checked_scalar(hint, value, bounds)
 
 
@@ -232,30 +232,28 @@ def _is_none(value: Any) -> bool:  # noqa: ANN401
     return value is None or (isinstance(value, str) and value == NONE_WORD)
 
 
-def _checked_tuple(hint: Any, value: Any, bounds: Range | None) -> tuple[Any, ...]:  # noqa: ANN401
-    items = get_args(hint)
+def _checked_tuple(items: tuple[Any, ...], value: Any, bounds: Range | None) -> tuple[Any, ...]:  # noqa: ANN401
     if not isinstance(value, list | tuple):
-        raise ValueError(f"expected {type_text(hint)}")
+        raise ValueError("not a list")
     if items[-1] is Ellipsis:
         items = (items[0],) * len(value)
     if len(value) != len(items):
-        raise ValueError(f"expected {type_text(hint)}, found {len(value)} items")
+        raise ValueError("not as many items")
     return tuple(_checked(item, part, bounds) for item, part in zip(items, value, strict=True))
 
 
 def _checked_scalar(kind: Any, value: Any, bounds: Range | None) -> Any:  # noqa: ANN401
     if kind not in SCALAR_TEXT:
         raise TypeError(f"settings cannot have fields of type {kind!r}")
-    expected = f"expected {expected_text(kind, bounds)}"
     if kind is float and type(value) is int:
         try:
             value = float(value)
         except OverflowError as error:
-            raise ValueError(expected) from error
+            raise ValueError("too large") from error
     if type(value) is not kind or (kind is float and not math.isfinite(value)):
-        raise ValueError(expected)
+        raise ValueError("another type")
     if bounds is not None and not bounds.holds(value):
-        raise ValueError(expected)
+        raise ValueError("out of range")
     return value
 
 
@@ -319,14 +317,16 @@ def _unknown_key(
     """The text for an unknown key; looks for a like one beside it first, then anywhere."""
     near = [f"{prefix}{name}" for name in difflib.get_close_matches(key, names, n=1)]
     if not near:
-        near = [known for known in known_keys if known.rsplit(".", 1)[-1] == key]
-        near = near or difflib.get_close_matches(f"{prefix}{key}", known_keys, n=1)
+        by_name = {known.rsplit(".", 1)[-1]: known for known in reversed(known_keys)}
+        near = [by_name[name] for name in difflib.get_close_matches(key, by_name, n=1)]
     hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(names)}"
     return f"{origin}: {prefix}{key} = {value_text(value)}: unknown key; {hint}"
 
 
-def _hint_of_choice(value: Any, choices: Sequence[Any]) -> str:  # noqa: ANN401
-    near = difflib.get_close_matches(str(value), [str(choice) for choice in choices], n=1)
+def _like_choice(hint: Any, value: Any) -> str:  # noqa: ANN401
+    """For a misspelt choice, the one that was perhaps meant."""
+    choices = [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []
+    near = difflib.get_close_matches(str(value), choices, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 

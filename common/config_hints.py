@@ -28,6 +28,11 @@ class Range:
             return False
         return self.high is None or value < self.high or (not self.high_open and value == self.high)
 
+    @property
+    def is_two_sided(self) -> bool:
+        """Whether both bounds are set."""
+        return self.low is not None and self.high is not None
+
     def __str__(self) -> str:
         if self.low is not None and self.high is not None:
             return f"{'(' if self.low_open else '['}{self.low:.10g}, {self.high:.10g}{')' if self.high_open else ']'}"
@@ -63,20 +68,23 @@ def default_of(field: "dataclasses.Field[Any]") -> Any:  # noqa: ANN401
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
-def type_text(hint: Any) -> str:  # noqa: ANN401
-    """A type in words, without its bounds."""
-    hint, _ = without_bounds(hint, None)
-    origin = get_origin(hint)
+def type_text(hint: Any, *, with_range: bool = False, bounds: Range | None = None) -> str:  # noqa: ANN401
+    """A type in words; with its bounds, which are those at ``hint``, else ``bounds``, if asked."""
+    hint, bounds = without_bounds(hint, bounds)
+    origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return f"{type_text(optional_part(hint))} or {NONE_WORD}"
+        return f"{type_text(optional_part(hint), with_range=with_range, bounds=bounds)} or {NONE_WORD}"
     if origin is Literal:
-        return "one of " + ", ".join(value_text(choice) for choice in get_args(hint))
+        return "one of " + ", ".join(value_text(choice) for choice in parts)
     if origin is tuple:
-        items = get_args(hint)
-        if items[-1] is Ellipsis:
-            return f"a list, each item {type_text(items[0])}"
-        return f"a list of {len(items)}: " + ", ".join(type_text(item) for item in items)
-    return SCALAR_TEXT.get(hint, str(hint))
+        texts = [type_text(item, with_range=with_range, bounds=bounds) for item in parts if item is not Ellipsis]
+        return (
+            f"a list, each item {texts[0]}" if parts[-1] is Ellipsis else f"a list of {len(texts)}: {', '.join(texts)}"
+        )
+    text = SCALAR_TEXT.get(hint, str(hint))
+    if bounds is None or not with_range:
+        return text
+    return f"{text} in the range {bounds}" if bounds.is_two_sided else f"{text} {bounds}"
 
 
 def range_text(hint: Any) -> str:  # noqa: ANN401
@@ -86,14 +94,6 @@ def range_text(hint: Any) -> str:  # noqa: ANN401
         return str(bounds)
     texts = [range_text(part) for part in get_args(inner)] if get_origin(inner) is not Literal else []
     return ", ".join(dict.fromkeys(text for text in texts if text))
-
-
-def expected_text(hint: Any, bounds: Range | None = None) -> str:  # noqa: ANN401
-    """Type and bounds, those at ``hint`` or else ``bounds``, as in "an integer in the range [0, 5]"."""
-    text = range_text(hint) or str(bounds or "")
-    if text.startswith(("[", "(")):
-        text = f"in the range {text}"
-    return f"{type_text(hint)} {text}".rstrip()
 
 
 def value_text(value: Any) -> str:  # noqa: ANN401

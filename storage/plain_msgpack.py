@@ -7,7 +7,7 @@ import msgpack  # type: ignore[import-untyped]
 
 MAX_BYTES = 65536  # of one packed value: bounds what a claimed length inside it can cost
 _MAX_DEPTH = 16
-_MAX_ITEMS = 4096  # of one array or map: a packed length is trusted with this much memory before its items are seen
+_MAX_ITEMS = 256  # of one array or map: unpacking takes memory for a claimed length before it sees the items
 
 
 def pack(value: Any) -> bytes:  # noqa: ANN401

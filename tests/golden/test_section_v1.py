@@ -1,0 +1,23 @@
+"""The committed section file of version 1 stays readable, and writing the same section gives the same bytes."""
+
+from pathlib import Path
+
+from helpers.sections import assert_same_section, small_section
+
+from vtslam.storage.section_file import read_section, verify_file, write_section
+
+GOLDEN = Path(__file__).with_name("section_v1.vts")
+SHA256 = "d1a387fa517d7115c7e8ffd7fc58f3f7c702cbba9235aa52acf87505187301db"
+
+
+def test_golden_file_is_the_committed_one() -> None:
+    assert verify_file(GOLDEN).hex() == SHA256
+
+
+def test_golden_file_is_read_bit_by_bit() -> None:
+    assert_same_section(read_section(GOLDEN), small_section())
+
+
+def test_golden_file_is_written_byte_by_byte(tmp_path: Path) -> None:
+    write_section(tmp_path / "again.vts", read_section(GOLDEN))
+    assert (tmp_path / "again.vts").read_bytes() == GOLDEN.read_bytes()
