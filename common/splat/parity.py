@@ -22,6 +22,7 @@ Float64 = npt.NDArray[np.float64]
 
 _ALPHA_BAND = 1e-6  # |alpha - alpha_min| of a left-out pixel; float32 rounding stays below
 _STOP_BAND = 1e-3  # the same for the transmittance, relative
+_DEPTH_FLOOR_M = 0.01  # where less depth has accumulated, errors are relative to this
 _GRADIENT_FLOOR = 1e-2  # absolute L1 below which a gradient counts as zero
 _STEP = 1e-3  # of finite differences, m and rad
 
@@ -43,8 +44,7 @@ class ParityReport:
 
     Attributes:
         scene: Its name. pixels, left_out: Number of pixels, and of those too near to a cut.
-        rgb, depth, alpha: Largest error over the pixels kept; depth relative to the distance of what is seen there
-            (accumulated depth / alpha), so that a faint pixel is held to the same error of alpha as the others.
+        rgb, depth, alpha: Largest error over the pixels kept; depth relative to the reference's.
         rgb_mean, depth_mean, alpha_mean: Mean error over all pixels.
         gradients: Relative L1 error by name: colors, log_radii, opacity_logits, means_m, pose.
     """
@@ -89,7 +89,7 @@ def compare(engine: Engine, reference: ReferenceEngine, scene: Scene) -> ParityR
     rgb, depth, alpha = (image.detach().numpy() for image in (truth.rgb, truth.depth_m, truth.alpha))
     errors = {
         "rgb": _errors(np.asarray(given.rgb), rgb, 1.0).max(-1),
-        "depth": _errors(np.asarray(given.depth_m), depth, np.where(alpha > 0.0, depth / np.maximum(alpha, 1e-9), 1.0)),
+        "depth": _errors(np.asarray(given.depth_m), depth, np.maximum(depth, _DEPTH_FLOOR_M)),
         "alpha": _errors(np.asarray(given.alpha), alpha, 1.0),
     }
     return ParityReport(

@@ -10,8 +10,8 @@ from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.splat.engine import RasterSettings, Splats
 
-# None is a multiple of 32, most of no power of two; small enough for the reference.
-_SIZES = ((33, 17), (7, 5), (65, 47), (1, 1), (50, 40), (31, 64), (16, 16), (1, 40), (61, 3), (48, 35))
+# Width, height: within a tile, across several, rarely a multiple of one; small enough for the reference.
+_SIZES = ((33, 17), (7, 5), (65, 47), (1, 1), (50, 40), (31, 64), (16, 16), (1, 40), (61, 3), (48, 35), (97, 66))
 _DEPTH_GAP_M = 2e-5  # float32 keeps the order of depths further apart than this
 _NEAR_GAP_M = 1e-4  # and agrees on what lies behind the near plane
 
@@ -244,6 +244,17 @@ def scenes(
         if view_margin is not None:
             draft = _within_view(draft, camera, view_margin)
         yield _scene(rng, f"{kind}-{index}", draft, camera, settings, ties=kind == "ties")
+
+
+def crowded_scene(seed: int, count: int = 20_000) -> Scene:
+    """A small image with ``count`` Gaussians in and around it: more than a fast engine takes in one piece."""
+    rng = np.random.default_rng([seed, 2])
+    camera = _random_camera(rng, 33, 17)
+    draft = _scattered(rng, camera, count)
+    draft.means_px = rng.uniform(-1.0, 2.0, (count, 2)) * (camera.width, camera.height)
+    draft.sigma_px *= 0.5
+    draft.opacity *= 0.1
+    return _scene(rng, "crowded", draft, camera, RasterSettings(low_pass_px2=0.3))
 
 
 def smooth_scenes(seed: int, count: int) -> Iterator[Scene]:

@@ -35,8 +35,8 @@ def reference_mapping_loss(
     target_rgb: torch.Tensor,
     target_depth_m: torch.Tensor,
     *,
-    color_weight: float,
-    depth_weight: float,
+    weight_color: float,
+    weight_depth: float,
     ssim_share: float,
     mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
@@ -47,8 +47,8 @@ def reference_mapping_loss(
         depth_m: Rendered depth [H,W], not divided by alpha.
         target_rgb: Observed colour [H,W,3].
         target_depth_m: Observed depth [H,W]; 0 where there is none.
-        color_weight: w_color.
-        depth_weight: w_depth.
+        weight_color: w_color.
+        weight_depth: w_depth.
         ssim_share: s, 0 to 1.
         mask: bool [H,W]; the pixels that the two absolute differences count, all without it. SSIM counts all.
     """
@@ -58,4 +58,4 @@ def reference_mapping_loss(
     color = (rgb - target_rgb)[counted].abs().mean() if bool(counted.any()) else zero
     depth = (depth_m - target_depth_m)[deep].abs().mean() if bool(deep.any()) else zero
     color_term = (1.0 - ssim_share) * color + ssim_share * (1.0 - ssim(rgb, target_rgb))
-    return color_weight * color_term + depth_weight * depth
+    return weight_color * color_term + weight_depth * depth

@@ -44,7 +44,7 @@ def test_loss_weighs_its_terms() -> None:
     rgb, depth, target_rgb, target_depth = _images(9, 7)
     mask = torch.from_numpy(np.random.default_rng(1).random((9, 7)) < 0.5)
     given = reference_mapping_loss(
-        rgb, depth, target_rgb, target_depth, color_weight=0.5, depth_weight=2.0, ssim_share=0.2, mask=mask
+        rgb, depth, target_rgb, target_depth, weight_color=0.5, weight_depth=2.0, ssim_share=0.2, mask=mask
     )
     chosen = mask.numpy()
     color = np.abs(rgb.numpy() - target_rgb.numpy())[chosen].mean()
@@ -58,7 +58,7 @@ def test_no_depth_and_no_pixel_give_no_term() -> None:
     rgb, depth, target_rgb, target_depth = _images(3, 5)
     nothing = torch.zeros_like(target_depth)
     without_depth = reference_mapping_loss(
-        rgb, depth, target_rgb, nothing, color_weight=1.0, depth_weight=1.0, ssim_share=0.0
+        rgb, depth, target_rgb, nothing, weight_color=1.0, weight_depth=1.0, ssim_share=0.0
     )
     assert float(without_depth) == pytest.approx(float((rgb - target_rgb).abs().mean()))
     masked = reference_mapping_loss(
@@ -66,8 +66,8 @@ def test_no_depth_and_no_pixel_give_no_term() -> None:
         depth,
         target_rgb,
         target_depth,
-        color_weight=1.0,
-        depth_weight=1.0,
+        weight_color=1.0,
+        weight_depth=1.0,
         ssim_share=0.0,
         mask=nothing > 0.0,
     )
