@@ -29,6 +29,7 @@ class VtsParts:
     file_size: int | None = None
     index_offset: int | None = None
     index_length: int | None = None
+    sha256: bytes | None = None
 
     @property
     def rows(self) -> list[Any]:
@@ -86,7 +87,7 @@ class VtsParts:
             chosen(self.index_length, len(self.index)),
             zlib.crc32(self.index),
         )
-        checked = reference + hashlib.sha256(data + reference).digest()
+        checked = reference + (self.sha256 or hashlib.sha256(data + reference).digest())
         return data + checked + struct.pack("<I", zlib.crc32(checked)) + END_MARK
 
 

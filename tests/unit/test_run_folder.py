@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.sections import assert_same_section, small_section
 
+from vtslam.storage import run_folder
 from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked, UnreadableFile, WriteFailed
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.run_info import RunFacts, RunInfo
@@ -138,6 +139,20 @@ def test_second_writer_is_refused_and_told_who_is_first(path: Path) -> None:
         run.write_section(small_section())
         assert RunFolder.open(path).section_ids() == [7]
     RunFolder.open(path, writable=True).close()
+
+
+def test_run_made_between_look_and_lock_is_kept(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow_lock(folder: Path) -> int:
+        monkeypatch.undo()
+        with RunFolder.create(folder, INFO) as first:
+            first.write_section(small_section())
+        return run_folder._take_lock(folder)
+
+    monkeypatch.setattr(run_folder, "_take_lock", slow_lock)
+    with pytest.raises(RunFolderError, match="there is already a run here"):
+        RunFolder.create(path, INFO)
+    with RunFolder.open(path, writable=True) as run:
+        assert run.section_ids() == [7]
 
 
 def test_lock_ends_with_its_process(path: Path) -> None:

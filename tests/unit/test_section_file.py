@@ -124,6 +124,8 @@ def test_columns_that_do_not_fit(path: Path, columns: dict[str, npt.NDArray[Any]
         ({"a": {"b": np.float32(1.0)}}, r"\.a\.b must be"),
         ({"a": [1, b"x"]}, r"\.a\[1\] must be"),
         ({"a": 2**63}, r"\.a must be"),
+        ({"a": [[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]}, "nested more than 16 deep"),
+        ({"a": list(range(257))}, r"\.a must be"),
         ({"a": "x" * 70000}, "takes 70008 bytes, at most 65536"),
     ],
 )
@@ -145,6 +147,24 @@ def test_full_disk_leaves_the_old_file_and_no_other(path: Path, monkeypatch: pyt
         write_section(path, small_section(section_id=8))
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_file_is_durable_before_its_name_and_then_the_name(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events = []
+    fsync, rename = os.fsync, Path.replace
+
+    def recorded_fsync(descriptor: int) -> None:
+        events.append(f"sync {Path(os.readlink(f'/proc/self/fd/{descriptor}')).suffix or 'folder'}")
+        fsync(descriptor)
+
+    def recorded_rename(self: Path, target: Path) -> Path:
+        events.append(f"rename to {target.name}")
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", recorded_fsync)
+    monkeypatch.setattr(Path, "replace", recorded_rename)
+    write_section(path, small_section())
+    assert events == ["sync .tmp", "rename to 000007.vts", "sync folder"]
 
 
 def test_interrupt_leaves_the_old_file_and_no_other(path: Path) -> None:
@@ -252,6 +272,27 @@ def _row(name: str, place: int, value: object) -> Callable[[VtsParts], VtsParts]
 
 
 @pytest.mark.parametrize(
+    "header",
+    [b"\x82\xa1b\x01\xa1a\x01", b"\x82\xa1a\x01\xa1a\x01", b"\x81\xa1a\xcc\x01", b"\x81\xa1a\xca\x3f\x80\x00\x00"],
+)
+def test_headers_in_another_form(path: Path, header: bytes) -> None:
+    # Unsorted, repeated, an integer in two bytes, a float in 32 bits.
+    body = bytes(64 - 32 - len(header))
+    path.write_bytes(VtsParts(header=header, body=body, index=b"\x90").sealed())
+    with pytest.raises(MalformedSection, match=r"header: is not in the one form that writers give it"):
+        read_columns(path)
+    path.write_bytes(VtsParts(header=b"\x81\xa1a\x01", body=bytes(28), index=b"\x90").sealed())
+    assert read_columns(path) == ({"a": 1}, {})
+
+
+def test_wrong_sha256_under_right_crcs(path: Path, parts: VtsParts) -> None:
+    path.write_bytes(replace(parts, sha256=bytes(32)).sealed())
+    with pytest.raises(ChecksumMismatch, match=r"000007\.vts: SHA-256: expected 0{64}, found [0-9a-f]{64}"):
+        read_section(path)
+    assert list(read_columns(path, ["depth"])[1]) == ["depth"]
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         (_row("depth", 0, "../depth"), r"expected a name like .*, found '\.\./depth'"),
@@ -267,6 +308,7 @@ def _row(name: str, place: int, value: object) -> Callable[[VtsParts], VtsParts]
         (_row("depth", 3, 64), "offset of column 'depth': expected"),
         (_row("depth", 4, 2**62), r"'depth': expected 40 bytes for uint16 \[20\], found"),
         (_row("depth", 4, -1), r"'depth': expected 40 bytes for uint16 \[20\], found -1"),
+        (_row("depth", 6, True), r"expected \[name, dtype, shape"),
         (_row("depth", 5, "lz4"), "codec 'raw', found 'depth', 'uint16', 'lz4'"),
         (lambda parts: parts.with_rows(parts.rows[:-1]), "offset of the index: expected"),
         (lambda parts: parts.with_rows([*parts.rows[:-1], []]), r"expected \[name, dtype"),
@@ -274,6 +316,9 @@ def _row(name: str, place: int, value: object) -> Callable[[VtsParts], VtsParts]
         (lambda parts: replace(parts, index=b""), "index: is not msgpack"),
         (lambda parts: replace(parts, index=b"\xdd\xff\xff\xff\xff" * 20), "index: is not msgpack"),
         (lambda parts: replace(parts, index=b"\x91" * 2000 + b"\xc0"), "index: is not msgpack|nested more"),
+        (lambda parts: replace(parts, index=b"\x91" * 20 + b"\xc0"), "index: .* nested more than 16 deep"),
+        (lambda parts: replace(parts, index=bytes(65537)), "index: expected at most 65536 bytes that end at"),
+        (lambda parts: replace(parts, index=b"\xdc\x00\x0d" + parts.index[1:]), "index: is not in the one form"),
         (lambda parts: replace(parts, header=b"\xc0" + parts.header[1:]), "header: is not msgpack"),
         (lambda parts: replace(parts, header_length=60000), "header length: expected at most"),
         (lambda parts: replace(parts, index_length=2**32 - 1), "index: expected at most 65536 bytes that end at"),
