@@ -187,15 +187,11 @@ class System:
     def _neighbours(self, active: ActiveSection) -> list[Section]:
         return [self.map.section(i) for i in active.neighbour_ids]
 
-    def _head_neighbours(
-        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], section_id: int
-    ) -> list[Section]:
+    def _head_neighbours(self, frame: Frame, T_world_camera: npt.NDArray[np.float64], section_id: int) -> list[Section]:
         """The previous section and the one with the largest overlap (Eq. 2), without repetition."""
         if section_id == 0 or self.settings.mapper.neighbour_weight == 0:
             return []
-        overlap = replace(
-            self.settings.tracker.overlap, depth_consistency=self.settings.tracker.visibility_tolerance
-        )
+        overlap = replace(self.settings.tracker.overlap, depth_consistency=self.settings.tracker.visibility_tolerance)
         views = self.map.candidate_views()
         points = world_points_m(frame, T_world_camera, frame.depth > 0)
         shares = overlap_shares(points, views, overlap)

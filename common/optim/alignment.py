@@ -68,9 +68,7 @@ class Alignment:
 
 def _halved_camera(camera: Camera) -> Camera:
     width, height = camera.width // 2, camera.height // 2
-    return Camera(
-        width=width, height=height, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2, cy=camera.cy / 2
-    )
+    return Camera(width=width, height=height, fx=camera.fx / 2, fy=camera.fy / 2, cx=camera.cx / 2, cy=camera.cy / 2)
 
 
 def _quads(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -224,7 +222,7 @@ def _solved_level(
         if system.visible < _MIN_PIXELS:
             break
         damped = system.H + _DAMPING * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
-        step = -np.linalg.solve(damped, system.g)
+        step = np.asarray(-np.linalg.solve(damped, system.g), np.float64)
         trial = _linearised(reference, observed, se3.exp(step) @ T, settings, prior, threads)
         if trial.mean_cost > system.mean_cost or trial.visible < _MIN_PIXELS:
             step = 0.5 * step

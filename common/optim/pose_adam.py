@@ -17,9 +17,7 @@ def _quaternion_product(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) 
 class PoseAdam:
     """State of Adam over the 7 numbers (quaternion x y z w, translation m) of a pose ``T_camera_map``."""
 
-    def __init__(
-        self, T_camera_map: npt.NDArray[np.float64], *, rate_rotation: float, rate_translation: float
-    ) -> None:
+    def __init__(self, T_camera_map: npt.NDArray[np.float64], *, rate_rotation: float, rate_translation: float) -> None:
         self._parameters = np.concatenate([se3.quaternion_xyzw(T_camera_map), T_camera_map[:3, 3]])
         self._rates = np.array([rate_rotation] * 4 + [rate_translation] * 3)
         self._m, self._v, self._step = np.zeros(7), np.zeros(7), 0

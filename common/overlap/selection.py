@@ -74,14 +74,16 @@ def seen_by_view(
     return out
 
 
-def _bilinear(image: npt.NDArray[np.uint16], x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> np.ndarray:
+def _bilinear(
+    image: npt.NDArray[np.uint16], x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
     """Samples [N] of an image at integer-centred coordinates; zeros outside."""
     # cv2.remap takes maps of at most 32767 rows: shape them as a wide image.
     columns = 1024
     rows = -(-x.size // columns)
-    maps = np.full((2, rows * columns), -10.0, np.float32)
-    maps[0, : x.size], maps[1, : x.size] = x, y
-    maps = maps.reshape(2, rows, columns)
+    flat = np.full((2, rows * columns), -10.0, np.float32)
+    flat[0, : x.size], flat[1, : x.size] = x, y
+    maps = flat.reshape(2, rows, columns)
     sampled = cv2.remap(image.astype(np.float32), maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return np.asarray(sampled, np.float64).reshape(-1)[: x.size]
 

@@ -166,7 +166,7 @@ class Tracker:
         if prior is not None:
             relative = PosePrior(
                 T_camera_map=se3.inverse(section.T_section_camera(prior.T_world_camera)),
-                information=np.linalg.inv(prior.covariance),
+                information=np.asarray(np.linalg.inv(prior.covariance), np.float64),
             )
         return make_optimiser(
             frame,

@@ -109,5 +109,7 @@ class TrackerState:
             committed_poses=(*self.committed_poses, T_world_camera)[-2:],
             previous_frame=frame,
             losses=losses,
-            largest_mean_depths_m=self.with_mean_depth(mean_depth_m) if mean_depth_m > 0 else self.largest_mean_depths_m,
+            largest_mean_depths_m=self.with_mean_depth(mean_depth_m)
+            if mean_depth_m > 0
+            else self.largest_mean_depths_m,
         )

@@ -3,6 +3,9 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
 
+#include <cstdint>
+#include <initializer_list>
+#include <string>
 #include <tuple>
 
 #include "alignment.hpp"
@@ -37,10 +40,12 @@ vtslam::Pinhole pinhole(const std::tuple<float, float, float, float>& k) {
 }
 
 using Intrinsics = std::tuple<float, float, float, float>;
+using System = std::tuple<Out<double, 2>, Out<double, 1>, double, double, int64_t, int64_t, int64_t>;
+using Loss = std::tuple<double, double, int64_t, Out<float, 3>, Out<float, 2>>;
 
-nb::tuple normal_equations(In<float, 3> rgb, In<float, 2> depth, In<float, 3> normals, In<uint8_t, 2> mask,
-                           In<float, 3> packed, Intrinsics camera, In<double, 2> T_observed_reference,
-                           const vtslam::AlignmentOptions& options, int threads) {
+System normal_equations(In<float, 3> rgb, In<float, 2> depth, In<float, 3> normals, In<uint8_t, 2> mask,
+                        In<float, 3> packed, Intrinsics camera, In<double, 2> T_observed_reference,
+                        const vtslam::AlignmentOptions& options, int threads) {
   const size_t h = depth.shape(0), w = depth.shape(1);
   require(rgb, {h, w, 3}, "rgb");
   require(normals, {h, w, 3}, "normals");
@@ -65,8 +70,8 @@ nb::tuple normal_equations(In<float, 3> rgb, In<float, 2> depth, In<float, 3> no
     g[i] = out.g[i];
     for (int j = i; j < 6; ++j) H[6 * i + j] = H[6 * j + i] = out.H[k++];
   }
-  return nb::make_tuple(Out<double, 2>(H, {6, 6}, h_owner), Out<double, 1>(g, {6}, g_owner), out.color_cost,
-                        out.depth_cost, out.color_count, out.depth_count, out.visible_count);
+  return System(Out<double, 2>(H, {6, 6}, h_owner), Out<double, 1>(g, {6}, g_owner), out.color_cost, out.depth_cost,
+                out.color_count, out.depth_count, out.visible_count);
 }
 
 Out<float, 3> normals_from_depth(In<float, 2> depth, Intrinsics camera, float max_relative_step) {
@@ -81,9 +86,9 @@ Out<float, 3> normals_from_depth(In<float, 2> depth, Intrinsics camera, float ma
   return Out<float, 3>(normals, {h, w, 3}, owner);
 }
 
-nb::tuple tracking_loss(In<float, 3> rgb, In<float, 2> depth, In<float, 2> alpha, In<float, 3> target_rgb,
-                        In<float, 2> target_depth, In<uint8_t, 2> mask, float silhouette_threshold, float color_weight,
-                        float depth_weight) {
+Loss tracking_loss(In<float, 3> rgb, In<float, 2> depth, In<float, 2> alpha, In<float, 3> target_rgb,
+                   In<float, 2> target_depth, In<uint8_t, 2> mask, float silhouette_threshold, float color_weight,
+                   float depth_weight) {
   const size_t h = depth.shape(0), w = depth.shape(1);
   require(rgb, {h, w, 3}, "rgb");
   require(alpha, {h, w}, "alpha");
@@ -100,8 +105,8 @@ nb::tuple tracking_loss(In<float, 3> rgb, In<float, 2> depth, In<float, 2> alpha
                                   mask.data(), silhouette_threshold, color_weight, depth_weight},
                                  h * w, d_rgb, d_depth);
   }
-  return nb::make_tuple(loss.color_sum, loss.depth_sum, loss.count, Out<float, 3>(d_rgb, {h, w, 3}, rgb_owner),
-                        Out<float, 2>(d_depth, {h, w}, depth_owner));
+  return Loss(loss.color_sum, loss.depth_sum, loss.count, Out<float, 3>(d_rgb, {h, w, 3}, rgb_owner),
+              Out<float, 2>(d_depth, {h, w}, depth_owner));
 }
 
 }  // namespace
@@ -113,8 +118,9 @@ NB_MODULE(_align, m) {
           "__init__",
           [](vtslam::AlignmentOptions* self, float color_sigma, float color_weight, float depth_sigma_base,
              float depth_sigma_quadratic, float depth_weight, float depth_gate_sigmas, float border_px) {
-            new (self) vtslam::AlignmentOptions{color_sigma,  color_weight,      depth_sigma_base, depth_sigma_quadratic,
-                                                depth_weight, depth_gate_sigmas, border_px};
+            new (self)
+                vtslam::AlignmentOptions{color_sigma,  color_weight,      depth_sigma_base, depth_sigma_quadratic,
+                                         depth_weight, depth_gate_sigmas, border_px};
           },
           nb::kw_only(), "color_sigma"_a, "color_weight"_a, "depth_sigma_base"_a, "depth_sigma_quadratic"_a,
           "depth_weight"_a, "depth_gate_sigmas"_a, "border_px"_a);
