@@ -93,6 +93,7 @@ def _add_settings(commands: "_Commands[argparse.ArgumentParser]") -> None:
 def _add_doctor(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command = _command(commands, "doctor", "check the installation and this machine", example="vtslam doctor")
     command.add_argument("--gpu", action="store_true", help="check the CUDA engine against the reference instead")
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 
 def _add_layers(command: argparse.ArgumentParser) -> None:

@@ -25,6 +25,10 @@ def execute(args: Namespace) -> int:
 
 def _command(args: Namespace) -> int:
     match args.command:
+        case "demo":
+            from vtslam.services.cli.demo_command import demo_command
+
+            return demo_command(args)
         case "run":
             from vtslam.services.cli.run_command import run_command
 
@@ -33,6 +37,14 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.eval_command import eval_command
 
             return eval_command(args)
+        case "settings":
+            from vtslam.services.cli.settings_command import settings_command
+
+            return settings_command(args)
+        case "doctor":
+            from vtslam.services.cli.doctor_command import doctor_command
+
+            return doctor_command(args)
     raise AssertionError(f"no command {args.command}")
 
 

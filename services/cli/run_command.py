@@ -23,7 +23,7 @@ def run_command(args: Namespace) -> int:
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
         summary = watched_run(plan, args.out, stop, overwrite=args.overwrite)
-    console.print(summary_text(summary, args.out))
+    console.print(f"{summary_text(summary)}\nrun folder: {args.out}   (next: vtslam eval {args.out})")
     console.result({"run": str(args.out.resolve()), "source": plan.source.uri, **asdict(summary)})
     return stop.exit_status if summary.interrupted else 0
 
@@ -38,7 +38,7 @@ def watched_run(
         )
 
 
-def summary_text(summary: RunSummary, out: Path) -> str:
+def summary_text(summary: RunSummary) -> str:
     """The end of a run in words."""
     rate = summary.frames / summary.seconds if summary.seconds > 0 else 0.0
     lines = [
@@ -49,7 +49,6 @@ def summary_text(summary: RunSummary, out: Path) -> str:
         lines.append(f"tracking was weak on {summary.weak} frames and lost on {summary.lost}")
     if summary.interrupted:
         lines.append("stopped early; what was done is kept")
-    lines.append(f"run folder: {out}   (next: vtslam eval {out})")
     return "\n".join(lines)
 
 

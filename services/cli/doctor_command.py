@@ -1,0 +1,102 @@
+"""``vtslam doctor``: is everything here that a run needs, and does it compute what it should?"""
+
+import os
+import platform
+import shutil
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+from vtslam.services.cli.console import Console
+from vtslam.services.process_facts import package_version, program_version
+
+_MIN_FREE_MB = 2000.0  # a long run at 640x480 stays below this
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One line of the examination: what was looked at, whether it is well, and what was found."""
+
+    name: str
+    ok: bool
+    found: str
+
+
+def doctor_command(args: Namespace) -> int:
+    """Examine as the arguments say; 0 if all is well."""
+    console = Console(args.json)
+    if args.gpu:
+        from vtslam.services.cli.doctor_gpu import run_gpu_doctor
+
+        return run_gpu_doctor(console.text)
+    findings = []
+    for finding in examine():
+        findings.append(finding)
+        console.print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name:<10}  {finding.found}")
+    console.result({"ok": all(f.ok for f in findings), "findings": [asdict(f) for f in findings]})
+    return 0 if all(f.ok for f in findings) else 1
+
+
+def examine() -> Iterator[Finding]:
+    """All findings, one by one."""
+    yield Finding(name="vtslam", ok=True, found=program_version())
+    system = f"{platform.system()} {platform.release()}, {platform.machine()}"
+    yield Finding(name="system", ok=platform.system() == "Linux", found=system)
+    yield Finding(name="python", ok=sys.version_info >= (3, 11), found=platform.python_version())
+    for package in ("numpy", "opencv-python-headless", "msgpack"):
+        yield Finding(name=package.partition("-")[0], ok=True, found=package_version(package))
+    yield from _native_findings()
+    yield _memory()
+    yield _disk()
+
+
+def _native_findings() -> Iterator[Finding]:
+    try:
+        from vtslam.common.optim import _align  # noqa: F401
+        from vtslam.common.splat import _native
+        from vtslam.services.sensor.sources import _raycast  # noqa: F401
+    except ImportError as error:
+        yield Finding(name="native", ok=False, found=f"{error}; install vtslam again with a C++ compiler at hand")
+        return
+    cores = len(os.sched_getaffinity(0))
+    yield Finding(name="threads", ok=True, found=f"{_native.threads()} of {cores} cores that this process may use")
+    for name in _native.available_simd():
+        chosen = " (in use)" if name == _native.simd() else ""
+        yield _checked(name, partial(_on_simd, name), after=chosen)
+
+
+def _on_simd(name: str) -> str:
+    """The self-test on one instruction set, leaving the choice as it was."""
+    from vtslam.common.splat import _native
+    from vtslam.services.cli.render_check import largest_error
+
+    chosen = _native.simd()
+    _native.select_simd(name)
+    try:
+        error = largest_error()
+    finally:
+        _native.select_simd(chosen)
+    if not error < 1e-5:
+        raise ArithmeticError(f"renders wrongly: {error:.2g} away from the known numbers")
+    return f"renders the known numbers to {error:.1g}"
+
+
+def _checked(name: str, check: Callable[[], str], *, after: str) -> Finding:
+    try:
+        return Finding(name=name, ok=True, found=check() + after)
+    except (ArithmeticError, ValueError) as error:
+        return Finding(name=name, ok=False, found=f"{error}{after}")
+
+
+def _memory() -> Finding:
+    lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    free_mb = next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("MemAvailable:"))
+    return Finding(name="memory", ok=free_mb > _MIN_FREE_MB, found=f"{free_mb:.0f} MB available")
+
+
+def _disk() -> Finding:
+    free_mb = shutil.disk_usage(Path.cwd()).free / 1e6
+    return Finding(name="disk", ok=free_mb > _MIN_FREE_MB, found=f"{free_mb:.0f} MB free in {Path.cwd()}")
