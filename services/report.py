@@ -10,7 +10,7 @@ import numpy as np
 from vtslam.common.metrics_trajectory import aligning_motion, trajectory_errors
 from vtslam.services.evaluation import write_metrics
 from vtslam.services.recorded_run import RecordedRun
-from vtslam.services.report_pictures import Picture, frame_picture, stacked
+from vtslam.services.report_pictures import Picture, frame_picture, in_columns, stacked
 from vtslam.services.report_plot import trajectory_plot
 from vtslam.storage.atomic import replace_file
 
@@ -35,8 +35,8 @@ def write_report(run: RecordedRun, values: Mapping[str, Any]) -> Path:
     folder = run.folder.path / _PICTURES
     folder.mkdir(exist_ok=True)
     strips = {f"frame-{frame_id:06d}.png": _strip(run, frame_id) for frame_id in _shown_frames(run)}
-    plot = _trajectory(run)
-    pictures = {"overview.png": stacked([plot, *strips.values()]), "trajectory.png": plot, **strips}
+    plot, sheet = _trajectory(run), in_columns(list(strips.values()), 2)
+    pictures = {"overview.png": stacked([plot, sheet]), "trajectory.png": plot, **strips}
     for name, picture in pictures.items():
         _write_picture(folder / name, picture)
     facts = run.info.facts

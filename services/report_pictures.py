@@ -1,5 +1,7 @@
 """Pictures that show a run to people: what was seen, what the map shows instead, and where they differ."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +20,7 @@ def frame_picture(frame: Frame, rendering: Rendering) -> Picture:
     """Two rows of labelled tiles: colour seen, rendered, their difference; depth seen, rendered, their difference."""
     seen, rendered = frame.rgb_float(), rendering.rgb
     depth_m, valid = frame.depth_m(), frame.depth > 0
-    far_m = float(np.percentile(depth_m[valid], 99)) if valid.any() else 1.0
+    near_m, far_m = np.percentile(depth_m[valid], (1, 99)) if valid.any() else (0.0, 1.0)
     depth_error_m = np.abs(rendering.depth_m - depth_m) * valid
     color = [
         (f"frame {frame.frame_id}: input", _bgr(seen)),
@@ -26,8 +28,8 @@ def frame_picture(frame: Frame, rendering: Rendering) -> Picture:
         (f"difference x{ERROR_GAIN:g}", _bgr(ERROR_GAIN * np.abs(rendered - seen))),
     ]
     depth = [
-        (f"depth input (0 to {far_m:.1f} m)", _tinted(depth_m, far_m) * valid[..., None]),
-        ("depth rendered", _tinted(rendering.depth_m, far_m)),
+        (f"depth input, {near_m:.1f} to {far_m:.1f} m", _tinted(depth_m, near_m, far_m) * valid[..., None]),
+        ("depth rendered", _tinted(rendering.depth_m, near_m, far_m)),
         ("difference (white: 5 cm)", _gray(depth_error_m / 0.05)),
     ]
     return stacked([beside([labelled(tile, text) for text, tile in row]) for row in (color, depth)])
@@ -45,14 +47,21 @@ def write(picture: Picture, text: str, at: tuple[int, int], *, scale: float = 0.
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, thickness, cv2.LINE_AA)
 
 
-def beside(tiles: list[Picture]) -> Picture:
+def beside(tiles: Sequence[Picture]) -> Picture:
     """Tiles of one height in a row."""
     gap = np.full((tiles[0].shape[0], _GAP_PX, 3), _BACKGROUND, np.uint8)
     parts = [part for tile in tiles for part in (gap, tile)]
     return np.concatenate(parts[1:], axis=1)
 
 
-def stacked(pictures: list[Picture]) -> Picture:
+def in_columns(pictures: Sequence[Picture], columns: int) -> Picture:
+    """Pictures of one size in rows of ``columns``, the last one padded with white."""
+    blank = np.full_like(pictures[0], 255)
+    padded = [*pictures, *[blank] * (-len(pictures) % columns)]
+    return stacked([beside(padded[first : first + columns]) for first in range(0, len(padded), columns)])
+
+
+def stacked(pictures: Sequence[Picture]) -> Picture:
     """Pictures one below the other, left-aligned on white."""
     width = max(picture.shape[1] for picture in pictures)
     padded = [
@@ -71,8 +80,9 @@ def _gray(values: npt.NDArray[np.floating]) -> Picture:
     return np.repeat(_bytes(values)[..., None], 3, axis=2)
 
 
-def _tinted(depth_m: npt.NDArray[np.floating], far_m: float) -> Picture:
-    return np.asarray(cv2.applyColorMap(_bytes(depth_m / far_m), cv2.COLORMAP_TURBO), np.uint8)
+def _tinted(depth_m: npt.NDArray[np.floating], near_m: float, far_m: float) -> Picture:
+    share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
+    return np.asarray(cv2.applyColorMap(_bytes(share), cv2.COLORMAP_TURBO), np.uint8)
 
 
 def _bytes(values: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:

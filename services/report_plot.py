@@ -80,7 +80,7 @@ def trajectory_plot(
                 from_zero=True,
             )
         )
-    return plotted(panels, size=(360, 320))
+    return plotted(panels, size=(480, 380))
 
 
 def _path(
