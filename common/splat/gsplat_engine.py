@@ -7,7 +7,7 @@ Where gsplat's image model differs from :mod:`vtslam.common.splat.engine`: cap, 
 constants of its kernels, so other values are refused; it evaluates the projection's Jacobian no further outside the
 image than 0.3 half-sizes (:data:`VIEW_MARGIN`), so Gaussians beyond that keep a bounded footprint; its backward pass
 recovers the transmittance from 1 - alpha in float32, which costs digits where pixels are nearly opaque, and its
-kernels are built with approximate exponentials and divisions. :data:`TOLERANCES` allows for the last two.
+kernels are built with approximate exponentials and divisions.
 """
 
 from typing import Any, NamedTuple
@@ -18,12 +18,10 @@ import torch
 
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.splat.engine import FloatArray, Gradients, RasterSettings, Rendering, Splats
-from vtslam.common.splat.parity import Tolerances
 from vtslam.common.splat.torch_inputs import SplatTensors, camera_points, checked_derivatives, checked_pose
 
 FIXED_CONSTANTS = {"alpha_cap": 0.999, "alpha_min": 1.0 / 255.0, "transmittance_min": 1e-4}
 VIEW_MARGIN = 0.3
-TOLERANCES = Tolerances(image=1e-4, image_mean=1e-5, gradient=2e-3)
 
 
 class GsplatUnavailableError(RuntimeError):

@@ -38,6 +38,11 @@ class Tolerances:
     left_out: float = 1e-3
 
 
+# gsplat's kernels use approximate exponentials and divisions, and recover the transmittance from 1 - alpha in float32.
+# Chosen from those causes, before anyone ran it.
+GSPLAT_TOLERANCES = Tolerances(image=1e-4, image_mean=1e-5, gradient=2e-3)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParityReport:
     """Errors of one scene.

@@ -49,14 +49,14 @@ def _missing(out: TextIO, device: str) -> str | None:
 
 def _run_suite(out: TextIO, count: int, device: str) -> int:
     from vtslam.common.splat import parity
-    from vtslam.common.splat.gsplat_engine import FIXED_CONSTANTS, TOLERANCES, VIEW_MARGIN, GsplatEngine
+    from vtslam.common.splat.gsplat_engine import FIXED_CONSTANTS, VIEW_MARGIN, GsplatEngine
 
     print("Comparing (gsplat builds its kernels at first use, which takes minutes) ...", file=out, flush=True)
     try:
         report = parity.run_suite(
             lambda settings: GsplatEngine(settings, device=device),
             count=count,
-            tolerances=TOLERANCES,
+            tolerances=parity.GSPLAT_TOLERANCES,
             alpha_caps=(FIXED_CONSTANTS["alpha_cap"],),
             view_margin=VIEW_MARGIN,
         )

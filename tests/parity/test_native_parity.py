@@ -1,5 +1,8 @@
 """The native engine, its fused loss and its optimiser against plain torch, on every instruction set of the machine."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -216,6 +219,21 @@ def test_a_mapping_step_is_that_of_plain_torch(simd: str) -> None:
     assert _relative_l1(gradients.log_radii, log_radii) < 1e-4
     assert _relative_l1(gradients.opacity_logits, opacity_logits) < 1e-4
     assert _relative_l1(gradients.pose.astype(np.float32), pose) < 1e-4
+
+
+def _simd_in_use(name: str) -> subprocess.CompletedProcess[str]:
+    """A fresh process started with `VTSLAM_SIMD`, which prints the instruction set it took."""
+    code = "from vtslam.common.splat import _native; print(_native.simd())"
+    environment = os.environ | {"VTSLAM_SIMD": name, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+
+
+def test_the_environment_chooses_the_instruction_set() -> None:
+    worst = _native.available_simd()[-1]
+    assert _simd_in_use(worst).stdout.strip() == worst
+    refused = _simd_in_use("mmx")
+    assert refused.returncode != 0
+    assert "instruction set 'mmx' is unknown or missing here" in refused.stderr
 
 
 def test_settings_reach_the_kernels() -> None:

@@ -11,7 +11,7 @@ from parity.gsplat_stand_in import stand_in_module
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.splat import parity
 from vtslam.common.splat.engine import RasterSettings, Splats
-from vtslam.common.splat.gsplat_engine import TOLERANCES, VIEW_MARGIN, GsplatEngine, GsplatUnavailableError
+from vtslam.common.splat.gsplat_engine import VIEW_MARGIN, GsplatEngine, GsplatUnavailableError
 from vtslam.common.splat.parity_scenes import scenes
 from vtslam.services.cli.doctor_gpu import run_gpu_doctor
 
@@ -33,7 +33,7 @@ def _suite(count: int) -> parity.SuiteReport:
     return parity.run_suite(
         lambda settings: GsplatEngine(settings, device="cpu"),
         count=count,
-        tolerances=TOLERANCES,
+        tolerances=parity.GSPLAT_TOLERANCES,
         alpha_caps=(0.999,),
         view_margin=VIEW_MARGIN,
     )
