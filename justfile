@@ -42,14 +42,14 @@ imports:
 
 # Write the stubs of the native modules again
 stubs:
-    for module in {{native_modules}}; do \
+    @for module in {{native_modules}}; do \
       folder=${module%.*}; folder=${folder#vtslam.}; \
       uv run python -m nanobind.stubgen -q -m "$module" -O "${folder//.//}"; \
     done
 
 # The committed stubs are those of the built modules
 stubs-check:
-    out=$(mktemp -d); trap 'rm -rf "$out"' EXIT; \
+    @out=$(mktemp -d); trap 'rm -rf "$out"' EXIT; \
     for module in {{native_modules}}; do \
       path=${module#vtslam.}; path=${path//.//}.pyi; \
       uv run python -m nanobind.stubgen -q -m "$module" -O "$out"; \
