@@ -26,10 +26,10 @@ def furnished_room(seed: int, *, num_threads: int) -> Scene:
     _front_wall(scene, brush)
     _side_walls(scene, brush)
     _middle(scene, brush)
-    scene.light(Light(position=(2.5, 2.0, 2.45), strength=(0.85, 0.8, 0.7), reach_m=2.6))
-    scene.light(Light(position=(0.35, 2.0, 1.7), strength=(0.55, 0.65, 0.8), reach_m=2.2))
-    scene.light(Light(position=(4.45, 3.5, 1.75), strength=(0.8, 0.62, 0.42), reach_m=1.2))
-    return scene.build(ambient=(0.5, 0.5, 0.52), num_threads=num_threads)
+    scene.light(Light(position=(2.5, 2.0, 2.45), strength=(1.15, 1.08, 0.95), reach_m=2.6))
+    scene.light(Light(position=(0.35, 2.0, 1.7), strength=(0.75, 0.85, 1.0), reach_m=2.2))
+    scene.light(Light(position=(4.45, 3.5, 1.75), strength=(1.0, 0.78, 0.52), reach_m=1.2))
+    return scene.build(ambient=(0.62, 0.62, 0.64), num_threads=num_threads)
 
 
 def _materials(brush: Brush) -> dict[str, Material]:

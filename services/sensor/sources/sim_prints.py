@@ -19,10 +19,13 @@ def _colour(rng: np.random.Generator, low: int = 20, high: int = 240) -> tuple[i
     return r, g, b
 
 
-def _printed(brush: Brush, drawing: npt.NDArray[np.uint8], name: str, strength: float = 0.05) -> Image:
-    """A drawing as float image with the grain of its paper."""
+def _printed(
+    brush: Brush, drawing: npt.NDArray[np.uint8], name: str, strength: float = 0.05, *, contrast: float = 1.0
+) -> Image:
+    """A drawing as float image with the grain of its paper; ``contrast`` below 1 fades it towards grey."""
     grain = brush.grain((drawing.shape[0], drawing.shape[1]), name)
-    return np.asarray(drawing.astype(np.float32) / np.float32(255.0) + strength * grain[..., None], np.float32)
+    scale, offset = np.float32(contrast / 255.0), np.float32(0.5 * (1.0 - contrast))
+    return np.asarray(drawing.astype(np.float32) * scale + offset + strength * grain[..., None], np.float32)
 
 
 def shapes_poster(brush: Brush, name: str) -> Material:
@@ -39,7 +42,7 @@ def shapes_poster(brush: Brush, name: str) -> Material:
         else:
             end = (at[0] + int(rng.integers(-90, 90)), at[1] + int(rng.integers(-90, 90)))
             cv2.line(image, at, end, _colour(rng), int(rng.integers(2, 12)), cv2.LINE_AA)
-    return material(_printed(brush, image, name))
+    return material(_printed(brush, image, name, contrast=0.75))
 
 
 def page_poster(brush: Brush, name: str, *, paper: Colour, ink: Colour, columns: int = 2) -> Material:
@@ -63,7 +66,7 @@ def page_poster(brush: Brush, name: str, *, paper: Colour, ink: Colour, columns:
             text = _LETTERS[first : first + wide // 10]
             cv2.putText(image, text, (x, y + 6), cv2.FONT_HERSHEY_DUPLEX, 0.45, pen, 1, cv2.LINE_AA)
             y += 15
-    return material(_printed(brush, image, name))
+    return material(_printed(brush, image, name, contrast=0.6))
 
 
 def landscape(brush: Brush, name: str) -> Material:
@@ -72,7 +75,7 @@ def landscape(brush: Brush, name: str) -> Material:
     strokes = brush.noise(size, (64, 16), 3, 1.0, name + " strokes")
     v = np.linspace(0.0, 1.0, size[0], dtype=np.float32)[:, None] * np.ones((1, size[1]), np.float32)
     u = np.linspace(0.0, 1.0, size[1], dtype=np.float32)[None, :]
-    image = blend((0.35, 0.5, 0.78), (0.98, 0.72, 0.45), v * 1.7 + 0.14 * strokes)
+    image = blend((0.35, 0.5, 0.78), (0.98, 0.72, 0.45), v * 1.7 + 0.08 * strokes)
     sun = (u - 0.68) ** 2 + (v - 0.33) ** 2
     image[sun < 0.006] = (0.99, 0.93, 0.7)
     ridges = (
@@ -82,12 +85,12 @@ def landscape(brush: Brush, name: str) -> Material:
     )
     for k, (height, swing, dark, light) in enumerate(ridges):
         line = height + 0.5 * swing * brush.noise(size, (1, 3 + k), 5, 0.55, f"{name} ridge {k}")[:1]
-        image = np.where((v > line)[..., None], blend(dark, light, 0.5 + 0.3 * strokes), image)
+        image = np.where((v > line)[..., None], blend(dark, light, 0.5 + 0.17 * strokes), image)
     water = blend(
-        (0.2, 0.36, 0.5), (0.75, 0.68, 0.6), 0.4 + 0.35 * brush.noise(size, (128, 8), 3, 1.0, name + " water")
+        (0.2, 0.36, 0.5), (0.75, 0.68, 0.6), 0.4 + 0.2 * brush.noise(size, (128, 8), 3, 1.0, name + " water")
     )
     image = np.where((v > 0.84)[..., None], water, image)
-    return material(np.asarray(image + 0.04 * strokes[..., None], np.float32))
+    return material(np.asarray(image + 0.02 * strokes[..., None], np.float32))
 
 
 def land_map(brush: Brush, name: str) -> Material:
@@ -119,7 +122,7 @@ def rug(brush: Brush) -> Material:
     edge = np.minimum(np.minimum(v, size[0] - v), np.minimum(u, size[1] - u))
     cell_u, cell_v = np.abs(np.mod(u, 64.0) - 32.0), np.abs(np.mod(v, 64.0) - 32.0)
     star = np.minimum(cell_u + cell_v, 1.4 * np.maximum(cell_u, cell_v))
-    red, navy, cream, gold = (0.58, 0.12, 0.12), (0.12, 0.16, 0.34), (0.88, 0.8, 0.64), (0.78, 0.56, 0.2)
+    red, navy, cream, gold = (0.56, 0.2, 0.18), (0.2, 0.22, 0.36), (0.76, 0.68, 0.54), (0.66, 0.5, 0.26)
     image = np.broadcast_to(np.array(red, np.float32), (*size, 3)).copy()
     for low, high, colour in ((0.0, 10.0, gold), (10, 16, navy), (20, 26, cream), (8, 9, navy)):
         image[(star >= low) & (star < high)] = colour
@@ -143,13 +146,13 @@ def spines(brush: Brush) -> Material:
     for x in range(0, size, 16):
         for _ in range(3):
             y, tall = int(rng.integers(0, size)), int(rng.integers(4, 26))
-            tone = int(rng.choice([40, 90, 235, 250]))
+            tone = int(rng.choice([90, 130, 215, 235]))
             cv2.rectangle(image, (x, y), (x + 15, y + tall), (tone, tone, tone), -1)
         for y in range(int(rng.integers(0, 30)), size, 11):
-            if rng.random() < 0.55:
-                tone = int(rng.choice([20, 60, 250]))
+            if rng.random() < 0.4:
+                tone = int(rng.choice([60, 100, 240]))
                 cv2.line(image, (x + 3, y), (x + 12, y + int(rng.integers(0, 6))), (tone, tone, tone), 2)
-    return material(_printed(brush, image, "spines", 0.07))
+    return material(_printed(brush, image, "spines", 0.05, contrast=0.7))
 
 
 def pages(brush: Brush) -> Material:
@@ -174,7 +177,7 @@ def screen(brush: Brush) -> Material:
             cv2.line(image, (x, y), (min(x + wide, 500), y), hues[int(rng.integers(0, 5))], 3)
             x += wide + 7
         cv2.line(image, (8, y), (8 + int(rng.integers(15, 70)), y), (140, 150, 170), 3)
-    return material(_printed(brush, image, "screen", 0.025))
+    return material(_printed(brush, image, "screen", 0.02, contrast=0.55))
 
 
 def keyboard(brush: Brush) -> Material:
@@ -188,7 +191,7 @@ def keyboard(brush: Brush) -> Material:
             cv2.rectangle(image, (x, 8 + 23 * row), (min(x + wide, 504), 26 + 23 * row), (196, 196, 190), -1)
             cv2.circle(image, (x + 8, 15 + 23 * row), 3, (40, 40, 40), -1)
             x += wide + 5
-    return material(_printed(brush, image, "keyboard", 0.04))
+    return material(_printed(brush, image, "keyboard", 0.04, contrast=0.7))
 
 
 def clock(brush: Brush) -> Material:
@@ -203,7 +206,7 @@ def clock(brush: Brush) -> Material:
         cv2.line(image, a, b, (30, 30, 40), 6 if k % 5 == 0 else 2, cv2.LINE_AA)
     cv2.line(image, (128, 128), (84, 92), (20, 20, 30), 9, cv2.LINE_AA)
     cv2.line(image, (128, 128), (176, 66), (20, 20, 30), 5, cv2.LINE_AA)
-    return material(_printed(brush, image, "clock", 0.04))
+    return material(_printed(brush, image, "clock", 0.04, contrast=0.8))
 
 
 def cardboard(brush: Brush) -> Material:

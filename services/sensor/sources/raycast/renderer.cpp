@@ -1,6 +1,9 @@
 #include "renderer.hpp"
 
+#include <array>
 #include <limits>
+#include <numeric>
+#include <utility>
 #include <vector>
 
 #include "parallel.hpp"
@@ -8,14 +11,16 @@
 namespace raycast {
 namespace {
 
-constexpr int kTile = 8;  // pixels
+constexpr int kTile = 16, kSubTile = 4;  // pixels; the primitives in view are narrowed down in two steps
 constexpr double kNear = 0.01;
+// A pixel's colour is the mean over a square this wide, in pixels: like a lens, and wide enough not to alias.
+constexpr double kFilter = 1.4;
 
 // A primitive as one view sees it: rays in object coordinates are origin + t * (x * right + y * down + forward).
 struct Placed {
   Vec3 origin, right, down, forward;
-  Vec3 centre_camera, half;  // world-aligned bounds, centre in camera coordinates
-  double nearest_z;          // no point of the primitive is closer along the optical axis
+  Vec3 centre_camera, half;      // world-aligned bounds, centre in camera coordinates
+  double nearest_z, farthest_z;  // of those bounds, along the optical axis
 };
 
 struct Hit {
@@ -32,10 +37,20 @@ class Renderer {
   }
 
   void tile(int tile_x, int tile_y, const Images& out) const {
+    std::vector<int> all(placed_.size()), coarse, fine;
+    std::iota(all.begin(), all.end(), 0);
     const int x_end = std::min(view_.width, (tile_x + 1) * kTile), y_end = std::min(view_.height, (tile_y + 1) * kTile);
-    const auto candidates = in_tile(tile_x * kTile, x_end, tile_y * kTile, y_end);
-    for (int y = tile_y * kTile; y < y_end; ++y) {
-      for (int x = tile_x * kTile; x < x_end; ++x) pixel(candidates, x, y, out);
+    select(all, tile_x * kTile, x_end, tile_y * kTile, y_end, coarse);
+    std::stable_sort(coarse.begin(), coarse.end(),
+                     [&](int a, int b) { return placed_[a].nearest_z < placed_[b].nearest_z; });
+    for (int y = tile_y * kTile; y < y_end; y += kSubTile) {
+      for (int x = tile_x * kTile; x < x_end; x += kSubTile) {
+        const int x_stop = std::min(x + kSubTile, x_end), y_stop = std::min(y + kSubTile, y_end);
+        select(coarse, x, x_stop, y, y_stop, fine);
+        for (int py = y; py < y_stop; ++py) {
+          for (int px = x; px < x_stop; ++px) pixel(fine, px, py, out);
+        }
+      }
     }
   }
 
@@ -49,33 +64,35 @@ class Renderer {
                transposed_times(p.rotation, camera.column(2)),
                transposed_times(camera, offset),
                half_bounds(p),
+               0.0,
                0.0};
-    out.nearest_z = out.centre_camera.z - reach(out, {0, 0, 1});
+    const double half_depth = dot(absolute(camera.column(2)), out.half);
+    out.nearest_z = out.centre_camera.z - half_depth;
+    out.farthest_z = out.centre_camera.z + half_depth;
     return out;
   }
 
-  // Half the length of the primitive's bounds along a direction given in camera coordinates.
-  double reach(const Placed& p, Vec3 direction_camera) const {
-    const Vec3 d = view_.rotation * direction_camera;
-    return std::abs(d.x) * p.half.x + std::abs(d.y) * p.half.y + std::abs(d.z) * p.half.z;
-  }
-
+  // Place of ray i of n across the pixel, which itself reaches from 0 to 1.
+  static double within(int i, int n) { return 0.5 + kFilter * ((i + 0.5) / n - 0.5); }
   double ray_x(double u) const { return (u - view_.cx) / view_.fx; }
   double ray_y(double v) const { return (v - view_.cy) / view_.fy; }
 
-  // Primitives whose bounds meet the pyramid over the pixels, nearest first.
-  std::vector<int> in_tile(int x0, int x1, int y0, int y1) const {
-    const Vec3 planes[4] = {{1, 0, -ray_x(x0)}, {-1, 0, ray_x(x1)}, {0, 1, -ray_y(y0)}, {0, -1, ray_y(y1)}};
-    std::vector<int> found;
-    for (int i = 0; i < static_cast<int>(placed_.size()); ++i) {
+  // Those of the primitives in `from` whose bounds meet the pyramid over the pixels.
+  void select(const std::vector<int>& from, int x0, int x1, int y0, int y1, std::vector<int>& found) const {
+    constexpr double kMargin = 0.5 * (kFilter - 1.0);
+    const Vec3 planes[4] = {{1, 0, -ray_x(x0 - kMargin)},
+                            {-1, 0, ray_x(x1 + kMargin)},
+                            {0, 1, -ray_y(y0 - kMargin)},
+                            {0, -1, ray_y(y1 + kMargin)}};
+    Vec3 widths[4];  // |component| of each plane's normal in world axes: how far bounds reach along it
+    for (int k = 0; k < 4; ++k) widths[k] = absolute(view_.rotation * planes[k]);
+    found.clear();
+    for (const int i : from) {
       const Placed& p = placed_[i];
-      bool meets = p.centre_camera.z + reach(p, {0, 0, 1}) > kNear;
-      for (const Vec3& plane : planes) meets = meets && dot(plane, p.centre_camera) + reach(p, plane) >= 0.0;
+      bool meets = p.farthest_z > kNear;
+      for (int k = 0; k < 4 && meets; ++k) meets = dot(planes[k], p.centre_camera) + dot(widths[k], p.half) >= 0.0;
       if (meets) found.push_back(i);
     }
-    std::stable_sort(found.begin(), found.end(),
-                     [&](int a, int b) { return placed_[a].nearest_z < placed_[b].nearest_z; });
-    return found;
   }
 
   Hit cast(const std::vector<int>& candidates, double x, double y) const {
@@ -95,7 +112,7 @@ class Renderer {
     return surface_point(scene_.primitives()[hit.primitive], point, hit.face);
   }
 
-  // Texture colour (0..255) seen by a ray that stands for 1/rays of a pixel each way.
+  // Texture colour (0..255) seen by one of rays x rays that share a pixel.
   Rgb texture_colour(const Hit& hit, const SurfacePoint& s, double x, double y, int rays) const {
     const Placed& p = placed_[hit.primitive];
     const Surface& face = scene_.primitives()[hit.primitive].faces[hit.face];
@@ -104,7 +121,7 @@ class Renderer {
     if (std::abs(along) < 1e-3) along = along < 0.0 ? -1e-3 : 1e-3;
     // Where the neighbouring rays meet the tangent plane, to first order.
     const auto step = [&](Vec3 axis, double focal) {
-      return (hit.t / (focal * rays)) * (axis - (dot(axis, s.normal) / along) * direction);
+      return (kFilter * hit.t / (focal * rays)) * (axis - (dot(axis, s.normal) / along) * direction);
     };
     const Vec3 dx = step(p.right, view_.fx), dy = step(p.down, view_.fy);
     const Footprint footprint{
@@ -121,15 +138,21 @@ class Renderer {
     return scene_.irradiance(view_.position + hit.t * ray, p.rotation * s.normal) + glow;
   }
 
+  // Colour of a pixel where faces meet. Light varies slowly: each face is lit as at its first ray.
   Rgb fine_colour(const std::vector<int>& candidates, int px, int py) const {
-    constexpr int kRays = 4;
+    constexpr int kRays = 3;
+    std::array<std::pair<Hit, Rgb>, kRays * kRays> lit;
+    int num_lit = 0;
     Rgb sum{};
     for (int i = 0; i < kRays * kRays; ++i) {
-      const double x = ray_x(px + (i % kRays + 0.5) / kRays), y = ray_y(py + (i / kRays + 0.5) / kRays);
+      const double x = ray_x(px + within(i % kRays, kRays)), y = ray_y(py + within(i / kRays, kRays));
       const Hit hit = cast(candidates, x, y);
       if (hit.primitive < 0) continue;
       const SurfacePoint s = at(hit, x, y);
-      sum = sum + light(hit, s, x, y) * texture_colour(hit, s, x, y, kRays);
+      int k = 0;
+      while (k < num_lit && !lit[k].first.same_face(hit)) ++k;
+      if (k == num_lit) lit[num_lit++] = {hit, light(hit, s, x, y)};
+      sum = sum + lit[k].second * texture_colour(hit, s, x, y, kRays);
     }
     return (1.0f / (kRays * kRays)) * sum;
   }
@@ -143,7 +166,7 @@ class Renderer {
     Rgb albedo{};
     bool one_face = hit.primitive >= 0;
     for (int i = 0; i < 4 && one_face; ++i) {
-      const double sx = ray_x(px + 0.25 + 0.5 * (i % 2)), sy = ray_y(py + 0.25 + 0.5 * (i / 2));
+      const double sx = ray_x(px + within(i % 2, 2)), sy = ray_y(py + within(i / 2, 2));
       const Hit sub = cast(candidates, sx, sy);
       one_face = sub.same_face(hit);
       if (one_face) albedo = albedo + texture_colour(sub, at(sub, sx, sy), sx, sy, 2);

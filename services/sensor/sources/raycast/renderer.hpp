@@ -20,7 +20,7 @@ struct Images {
   float* cosine;      // height x width, of the angle between that ray and the surface normal, 0..1
 };
 
-// Depth is exact; colour is the mean over the pixel: 2x2 rays, 4x4 where they meet different faces.
+// Depth is exact; colour is the mean over the pixel: 2x2 rays, 3x3 where they meet different faces.
 void render(const Scene& scene, const View& view, int num_threads, const Images& out);
 
 }  // namespace raycast

@@ -138,11 +138,8 @@ double signed_distance(const Primitive& p, Vec3 point_world) {
 Vec3 half_bounds(const Primitive& p) {
   Vec3 h = p.size;
   if (p.kind == Kind::kCone) h.x = h.y = std::max(p.size.x, p.size.y);
-  const auto extent = [&](int i) {
-    const Vec3 r = p.rotation.row(i);
-    return std::abs(r.x) * h.x + std::abs(r.y) * h.y + std::abs(r.z) * h.z;
-  };
-  return {extent(0), extent(1), extent(2)};
+  return {dot(absolute(p.rotation.row(0)), h), dot(absolute(p.rotation.row(1)), h),
+          dot(absolute(p.rotation.row(2)), h)};
 }
 
 Scene::Scene(std::vector<Primitive> primitives, std::vector<Texture> textures, std::vector<Light> lights, Rgb ambient,

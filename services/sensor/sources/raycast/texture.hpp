@@ -23,10 +23,9 @@ class Texture {
   Rgb sampled(float u, float v, const Footprint& footprint) const;
 
  private:
-  using Texel = std::uint8_t __attribute__((vector_size(4)));  // r, g, b, unused
   struct Level {
     int width, height;
-    std::vector<Texel> texels;
+    std::vector<std::uint32_t> texels;  // r | g << 8 | b << 16
   };
   static Rgb bilinear(const Level& level, float u, float v);
   Rgb trilinear(float u, float v, float lod) const;
