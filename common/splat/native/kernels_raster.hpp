@@ -29,56 +29,56 @@ VTSLAM_INLINE LaneOffsets lane_offsets() {
 // A splat against a tile: the blocks it can touch and what is constant over them.
 struct Footprint {
   int first_x, last_x, first_y, last_y;
-  Vec column, row;  // offset of the lanes of block (0, 0) from the mean
+  Vec column, row;  // offset of the lanes of the first block from the mean
   Vec conic_xx, conic_xy, conic_yy, log2_opacity;
 };
 
 VTSLAM_INLINE int floor_div(int a, int b) { return a < 0 ? 0 : a / b; }
 VTSLAM_INLINE int smaller(int a, int b) { return a < b ? a : b; }
 
-VTSLAM_INLINE Footprint footprint(const SplatRecord& splat_record, int origin_x, int origin_y,
-                                  const LaneOffsets& lanes) {
-  const float column = (splat_record.column - float(origin_x)) - 0.5f;
-  const float row = (splat_record.row - float(origin_y)) - 0.5f;
+VTSLAM_INLINE Footprint footprint(const SplatRecord& record, int origin_x, int origin_y, const LaneOffsets& lanes) {
   Footprint f;
-  f.first_x = floor_div(splat_record.left - origin_x, kBlockWidth);
-  f.last_x = smaller(splat_record.right - origin_x, kTile - 1) / kBlockWidth;
-  f.first_y = floor_div(splat_record.top - origin_y, kBlockHeight);
-  f.last_y = smaller(splat_record.bottom - origin_y, kTile - 1) / kBlockHeight;
-  f.column = (lanes.column - splat(column)) - splat(splat_record.column_fraction);
-  f.row = (lanes.row - splat(row)) - splat(splat_record.row_fraction);
-  f.conic_xx = splat(splat_record.conic_xx);
-  f.conic_xy = splat(splat_record.conic_xy);
-  f.conic_yy = splat(splat_record.conic_yy);
-  f.log2_opacity = splat(splat_record.log2_opacity);
+  f.first_x = floor_div(record.left - origin_x, kBlockWidth);
+  f.last_x = smaller(record.right - origin_x, kTile - 1) / kBlockWidth;
+  f.first_y = floor_div(record.top - origin_y, kBlockHeight);
+  f.last_y = smaller(record.bottom - origin_y, kTile - 1) / kBlockHeight;
+  // Whole numbers first: exact, and the difference that is then rounded is small.
+  const float column = (float(origin_x + f.first_x * kBlockWidth) - record.column) + 0.5f;
+  const float row = (float(origin_y + f.first_y * kBlockHeight) - record.row) + 0.5f;
+  f.column = (lanes.column + splat(column)) - splat(record.column_fraction);
+  f.row = (lanes.row + splat(row)) - splat(record.row_fraction);
+  f.conic_xx = splat(record.conic_xx);
+  f.conic_xy = splat(record.conic_xy);
+  f.conic_yy = splat(record.conic_yy);
+  f.log2_opacity = splat(record.log2_opacity);
   return f;
 }
 
-// One splat over one block: which lanes it is blended in, its weight there, and the transmittance after it.
+// One splat over one block: where it is blended, its weight there, and the transmittance after it.
 struct Blend {
-  Mask blended;
-  Vec raw_alpha, alpha, weight, transmittance;
+  Mask blended;  // meaningful where alpha is not zero
+  Vec alpha;     // zero below alpha_min
+  Vec weight, transmittance;
 };
 
 struct Limits {
-  Vec alpha_cap, alpha_min, transmittance_min;
+  Vec alpha_cap, log2_alpha_cap, log2_alpha_min, transmittance_min;
 };
 
 VTSLAM_INLINE Limits limits_of(const Settings& settings) {
-  return {splat(settings.alpha_cap), splat(settings.alpha_min), splat(settings.transmittance_min)};
+  return {splat(settings.alpha_cap), log2_of(splat(settings.alpha_cap)), log2_of(splat(settings.alpha_min)),
+          splat(settings.transmittance_min)};
 }
 
 // The sign of the transmittance marks pixels that have ended: a further splat leaves it below the minimum.
 VTSLAM_INLINE Blend blend(Vec log2_alpha, Vec transmittance, const Limits& limits) {
   Blend b;
-  b.raw_alpha = exp2_of(log2_alpha);
-  b.alpha = minimum(b.raw_alpha, limits.alpha_cap);
-  const Vec weight = b.alpha * transmittance;
-  const Vec next = transmittance - weight;
-  const Mask present = at_least(b.alpha, limits.alpha_min);
-  b.blended = both(present, at_least(next, limits.transmittance_min));
-  b.weight = where(b.blended, weight);
-  b.transmittance = select(b.blended, next, negated_where(first_only(present, b.blended), transmittance));
+  const Mask present = at_least(log2_alpha, limits.log2_alpha_min);
+  b.alpha = where(present, minimum(exp2_of(log2_alpha), limits.alpha_cap));
+  const Vec next = fnma(b.alpha, transmittance, transmittance);
+  b.blended = at_least(next, limits.transmittance_min);
+  b.weight = where(b.blended, b.alpha * transmittance);
+  b.transmittance = select(b.blended, next, negative(transmittance));
   return b;
 }
 
@@ -142,13 +142,14 @@ void forward_tile(const ForwardArgs& args) {
     const Footprint f = footprint(record, origin_x, origin_y, lanes);
     const Vec red = splat(record.red), green = splat(record.green), blue = splat(record.blue);
     const Vec depth = splat(record.depth);
-    for (int y = f.first_y; y <= f.last_y; ++y) {
-      const Vec dy = f.row + splat(float(y * kBlockHeight));
+    Vec dy = f.row;
+    for (int y = f.first_y; y <= f.last_y; ++y, dy = dy + splat(float(kBlockHeight))) {
       const Vec by_x = f.conic_xy * dy, by_one = fma(f.conic_yy * dy, dy, f.log2_opacity);
-      for (int x = f.first_x; x <= f.last_x; ++x) {
+      Vec dx = f.column;
+      for (int x = f.first_x; x <= f.last_x; ++x, dx = dx + splat(float(kBlockWidth))) {
         Vec* s = state[y * kBlocksX + x];
-        const Vec dx = f.column + splat(float(x * kBlockWidth));
-        const Blend b = blend(fma(fma(f.conic_xx, dx, by_x), dx, by_one), s[4], limits);
+        const Vec log2_alpha = fma(fma(f.conic_xx, dx, by_x), dx, by_one);
+        const Blend b = blend(log2_alpha, s[4], limits);
         s[0] = fma(b.weight, red, s[0]);
         s[1] = fma(b.weight, green, s[1]);
         s[2] = fma(b.weight, blue, s[2]);
@@ -213,13 +214,14 @@ VTSLAM_INLINE void backward_splats(const BackwardArgs& args, Vec (*state)[kBackw
     const Vec depth = splat(record.depth);
     Vec sums[12];
     for (Vec& sum : sums) sum = zero;
-    for (int y = f.first_y; y <= f.last_y; ++y) {
-      const Vec dy = f.row + splat(float(y * kBlockHeight));
+    Vec dy = f.row;
+    for (int y = f.first_y; y <= f.last_y; ++y, dy = dy + splat(float(kBlockHeight))) {
       const Vec by_x = f.conic_xy * dy, by_one = fma(f.conic_yy * dy, dy, f.log2_opacity);
-      for (int x = f.first_x; x <= f.last_x; ++x) {
+      Vec dx = f.column;
+      for (int x = f.first_x; x <= f.last_x; ++x, dx = dx + splat(float(kBlockWidth))) {
         Vec* s = state[y * kBlocksX + x];
-        const Vec dx = f.column + splat(float(x * kBlockWidth));
-        const Blend b = blend(fma(fma(f.conic_xx, dx, by_x), dx, by_one), s[kTransmittance], limits);
+        const Vec log2_alpha = fma(fma(f.conic_xx, dx, by_x), dx, by_one);
+        const Blend b = blend(log2_alpha, s[kTransmittance], limits);
         s[kTransmittance] = b.transmittance;
         Vec by_weight = fma(s[kByRed], red, s[kByGreen] * green) + fma(s[kByBlue], blue, s[kByDepth] * depth);
         if (by_alpha) by_weight = by_weight + s[kByAlpha];
@@ -233,7 +235,7 @@ VTSLAM_INLINE void backward_splats(const BackwardArgs& args, Vec (*state)[kBackw
         const Vec own = b.weight * by_weight;
         s[kRemaining] = s[kRemaining] - own;
         const Vec behind = s[kRemaining] * (b.alpha * reciprocal(splat(1.0f) - b.alpha));
-        const Vec g = where(both(b.blended, at_least(limits.alpha_cap, b.raw_alpha)), own - behind);
+        const Vec g = where(both(b.blended, at_least(limits.log2_alpha_cap, log2_alpha)), own - behind);
         const Vec gx = g * dx, gy = g * dy;
         if (attributes) sums[kSumAlpha] = sums[kSumAlpha] + g;
         if (geometry) {

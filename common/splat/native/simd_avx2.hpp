@@ -23,20 +23,25 @@ VTSLAM_INLINE Vec square_root(Vec a) { return _mm256_sqrt_ps(a); }
 VTSLAM_INLINE Vec absolute(Vec a) { return _mm256_andnot_ps(splat(-0.0f), a); }
 VTSLAM_INLINE Mask at_least(Vec a, Vec b) { return _mm256_cmp_ps(a, b, _CMP_GE_OQ); }
 VTSLAM_INLINE Mask both(Mask a, Mask b) { return _mm256_and_ps(a, b); }
-VTSLAM_INLINE Mask first_only(Mask a, Mask b) { return _mm256_andnot_ps(b, a); }
 VTSLAM_INLINE bool any(Mask a) { return _mm256_movemask_ps(a) != 0; }
 VTSLAM_INLINE Vec select(Mask m, Vec a, Vec b) { return _mm256_blendv_ps(b, a, m); }
 VTSLAM_INLINE Vec where(Mask m, Vec a) { return _mm256_and_ps(m, a); }
-VTSLAM_INLINE Vec negated_where(Mask m, Vec a) { return _mm256_or_ps(a, _mm256_and_ps(m, splat(-0.0f))); }
+VTSLAM_INLINE Vec negative(Vec a) { return _mm256_or_ps(a, splat(-0.0f)); }  // -|a|
 VTSLAM_INLINE Vec rounded(Vec a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 
 // Exponents that scaled_by_power can take.
-VTSLAM_INLINE Vec bounded_exponent(Vec a) { return minimum(maximum(a, splat(-127.0f)), splat(128.0f)); }
+VTSLAM_INLINE Vec bounded_exponent(Vec a) { return minimum(maximum(a, splat(-126.0f)), splat(128.0f)); }
 
-// a * 2^n for whole n in [-127, 128]; 2^-127 is taken for zero.
+// a * 2^n for whole n in [-126, 128].
 VTSLAM_INLINE Vec scaled_by_power(Vec a, Vec n) {
   const __m256i e = _mm256_cvtps_epi32(n);
   return a * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(e, _mm256_set1_epi32(127)), 23));
+}
+
+// Splits a into a fraction in [0, 1), returned, and a whole part for scaled_by_power.
+VTSLAM_INLINE Vec fraction_of(Vec a, Vec& n) {
+  n = _mm256_floor_ps(a);
+  return a - n;
 }
 
 // 1 / a to about 1 unit in the last place (estimate of 12 bits and one Newton step); a normal and not zero.

@@ -23,12 +23,16 @@ VTSLAM_INLINE Vec square_root(Vec a) { return _mm512_sqrt_ps(a); }
 VTSLAM_INLINE Vec absolute(Vec a) { return _mm512_abs_ps(a); }
 VTSLAM_INLINE Mask at_least(Vec a, Vec b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
 VTSLAM_INLINE Mask both(Mask a, Mask b) { return a & b; }
-VTSLAM_INLINE Mask first_only(Mask a, Mask b) { return a & Mask(~b); }
 VTSLAM_INLINE bool any(Mask a) { return a != 0; }
 VTSLAM_INLINE Vec select(Mask m, Vec a, Vec b) { return _mm512_mask_blend_ps(m, b, a); }
 VTSLAM_INLINE Vec where(Mask m, Vec a) { return _mm512_maskz_mov_ps(m, a); }
-VTSLAM_INLINE Vec negated_where(Mask m, Vec a) { return _mm512_mask_or_ps(a, m, a, splat(-0.0f)); }  // -|a| under m
+VTSLAM_INLINE Vec negative(Vec a) { return _mm512_or_ps(a, splat(-0.0f)); }  // -|a|
 VTSLAM_INLINE Vec rounded(Vec a) { return _mm512_roundscale_ps(a, 0); }
+// Splits a into a fraction in [0, 1), returned, and a part n for scaled_by_power (which takes its floor).
+VTSLAM_INLINE Vec fraction_of(Vec a, Vec& n) {
+  n = a;
+  return _mm512_reduce_ps(a, 1);
+}
 VTSLAM_INLINE Vec bounded_exponent(Vec a) { return a; }
 VTSLAM_INLINE Vec scaled_by_power(Vec a, Vec n) { return _mm512_scalef_ps(a, n); }
 

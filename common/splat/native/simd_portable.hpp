@@ -25,14 +25,13 @@ VTSLAM_INLINE Mask bits(Vec a) { return (Mask)a; }
 VTSLAM_INLINE Vec from_bits(Mask a) { return (Vec)a; }
 VTSLAM_INLINE Mask at_least(Vec a, Vec b) { return a >= b; }
 VTSLAM_INLINE Mask both(Mask a, Mask b) { return a & b; }
-VTSLAM_INLINE Mask first_only(Mask a, Mask b) { return a & ~b; }
 VTSLAM_INLINE bool any(Mask a) { return (a[0] | a[1] | a[2] | a[3]) != 0; }
 VTSLAM_INLINE Vec select(Mask m, Vec a, Vec b) { return from_bits((bits(a) & m) | (bits(b) & ~m)); }
 VTSLAM_INLINE Vec where(Mask m, Vec a) { return from_bits(bits(a) & m); }
 VTSLAM_INLINE Vec minimum(Vec a, Vec b) { return select(a < b, a, b); }
 VTSLAM_INLINE Vec maximum(Vec a, Vec b) { return select(a > b, a, b); }
 VTSLAM_INLINE Vec absolute(Vec a) { return from_bits(bits(a) & 0x7FFFFFFF); }
-VTSLAM_INLINE Vec negated_where(Mask m, Vec a) { return from_bits(bits(a) | (m & bits(splat(-0.0f)))); }
+VTSLAM_INLINE Vec negative(Vec a) { return from_bits(bits(a) | bits(splat(-0.0f))); }  // -|a|
 VTSLAM_INLINE Vec square_root(Vec a) {
   return Vec{__builtin_sqrtf(a[0]), __builtin_sqrtf(a[1]), __builtin_sqrtf(a[2]), __builtin_sqrtf(a[3])};
 }
@@ -40,12 +39,17 @@ VTSLAM_INLINE Vec square_root(Vec a) {
 VTSLAM_INLINE Vec rounded(Vec a) { return (a + splat(12582912.0f)) - splat(12582912.0f); }
 
 // Exponents that scaled_by_power can take.
-VTSLAM_INLINE Vec bounded_exponent(Vec a) { return minimum(maximum(a, splat(-127.0f)), splat(128.0f)); }
+VTSLAM_INLINE Vec bounded_exponent(Vec a) { return minimum(maximum(a, splat(-126.0f)), splat(128.0f)); }
 
-// a * 2^n for whole n in [-127, 128]; 2^-127 is taken for zero.
+// a * 2^n for whole n in [-126, 128].
 VTSLAM_INLINE Vec scaled_by_power(Vec a, Vec n) {
   const Mask e = __builtin_convertvector(n, Mask);
   return a * from_bits((e + 127) << 23);
+}
+// Splits a into a fraction in [0, 1], returned, and a whole part for scaled_by_power.
+VTSLAM_INLINE Vec fraction_of(Vec a, Vec& n) {
+  n = rounded(a - splat(0.5f));
+  return a - n;
 }
 VTSLAM_INLINE Vec reciprocal(Vec a) { return 1.0f / a; }
 
