@@ -14,7 +14,7 @@ from vtslam.storage.atomic import replace_file
 METRICS_NAME = "metrics.json"
 
 
-def evaluate(run: RecordedRun, *, on_section: Callable[[], None] = lambda: None) -> dict[str, object]:
+def evaluate_run(run: RecordedRun, *, on_section: Callable[[], None] = lambda: None) -> dict[str, object]:
     """The content of ``metrics.json``: exactly the keys of :func:`vtslam.common.metrics.summarise`.
 
     Args:

@@ -16,18 +16,19 @@ from vtslam.storage.atomic import replace_file
 
 REPORT_NAME = "report.json"
 _PICTURES = "pictures"
+OVERVIEW_NAME = f"{_PICTURES}/overview.png"
 _NUM_FRAMES_SHOWN = 4
 
 
-def write_report(run: RecordedRun, values: Mapping[str, Any]) -> Path:
+def write_report(run: RecordedRun, values: Mapping[str, Any]) -> dict[str, object]:
     """Draw a run and write its ``report.json``: the metrics, what was run, and the pictures' names.
 
     Args:
         run: The run.
-        values: Its metrics (:func:`vtslam.services.evaluation.evaluate`).
+        values: Its metrics (:func:`vtslam.services.evaluation.evaluate_run`).
 
     Returns:
-        The picture to look at first.
+        The content of ``report.json``.
 
     Raises:
         SourceError, StorageError: A frame or section cannot be read, or a file cannot be written.
@@ -42,8 +43,9 @@ def write_report(run: RecordedRun, values: Mapping[str, Any]) -> Path:
     facts = run.info.facts
     about = {"source": facts.source, "preset": facts.preset, "family": facts.family, "created_by": facts.created_by}
     names = [f"{_PICTURES}/{name}" for name in pictures]
-    write_metrics(run.folder.path / REPORT_NAME, {**values, "run": about, "pictures": names})
-    return folder / "overview.png"
+    report = {**values, "run": about, "pictures": names}
+    write_metrics(run.folder.path / REPORT_NAME, report)
+    return report
 
 
 def _shown_frames(run: RecordedRun) -> Sequence[int]:

@@ -10,7 +10,7 @@ from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.evaluation import METRICS_NAME, write_metrics
 from vtslam.services.process_facts import program_version
 from vtslam.services.recorded_run import RecordedRun
-from vtslam.services.report import REPORT_NAME, write_report
+from vtslam.services.report import OVERVIEW_NAME, REPORT_NAME, write_report
 from vtslam.services.report_table import metrics_table
 from vtslam.services.run_plan import plan_run
 from vtslam.storage.errors import RunFolderError
@@ -41,10 +41,11 @@ def demo_command(args: Namespace) -> int:
     run = RecordedRun(args.out)
     values = watched_evaluation(run)
     write_metrics(args.out / METRICS_NAME, values)
-    overview = write_report(run, values)
+    report = write_report(run, values)
     console.print(metrics_table(values))
-    console.print(f"run folder: {args.out}   figures: {args.out / REPORT_NAME}\nlook at:    {overview}")
-    console.result(values)
+    console.print(f"run folder: {args.out}   figures: {args.out / REPORT_NAME}")
+    console.print(f"look at:    {args.out / OVERVIEW_NAME}")
+    console.result(report)
     return 0
 
 

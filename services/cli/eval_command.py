@@ -4,7 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from vtslam.services.cli.console import Console, Progress
-from vtslam.services.evaluation import METRICS_NAME, evaluate, write_metrics
+from vtslam.services.evaluation import METRICS_NAME, evaluate_run, write_metrics
 from vtslam.services.recorded_run import RecordedRun
 from vtslam.services.report_table import metrics_table
 
@@ -24,4 +24,4 @@ def eval_command(args: Namespace) -> int:
 def watched_evaluation(run: RecordedRun) -> dict[str, object]:
     """Evaluate with progress."""
     with Progress(len(run.section_ids()), what="evaluating", unit="section") as progress:
-        return evaluate(run, on_section=progress.step)
+        return evaluate_run(run, on_section=progress.step)

@@ -1,5 +1,6 @@
 """``vtslam run``: track and map a recording."""
 
+import json
 from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
@@ -55,4 +56,6 @@ def summary_text(summary: RunSummary) -> str:
 def _assignments(args: Namespace) -> list[str]:
     """``--set`` texts, and those that the short options stand for."""
     shorthands = {"source.size": args.size, "source.frames": args.frames, "holdout": args.holdout}
-    return [*args.assignments, *(f"{key}={value}" for key, value in shorthands.items() if value is not None)]
+    given = {key: value for key, value in shorthands.items() if value is not None}
+    # JSON's quotes are TOML's: a size of 48 stays a text, which the source then explains.
+    return [*args.assignments, *(f"{key}={json.dumps(value)}" for key, value in given.items())]

@@ -1,0 +1,60 @@
+"""Ctrl-C and SIGTERM in the middle of a run."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.processes import source_environment
+
+from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.cli.__main__ import main
+from vtslam.storage.run_folder import RunFolder
+
+_DEADLINE_S, _POLL_S = 60.0, 0.02
+
+
+def wait_for(path: Path, process: "subprocess.Popen[str]") -> None:
+    """Until ``path`` is there; fails if the process ends first or the deadline passes."""
+    for _ in range(int(_DEADLINE_S / _POLL_S)):
+        if path.exists():
+            return
+        try:
+            process.wait(_POLL_S)
+        except subprocess.TimeoutExpired:
+            continue
+        break
+    raise AssertionError(f"{path} did not appear; the process ended with {process.poll()}")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_the_current_frame_is_finished_and_what_was_done_is_kept(
+    number: signal.Signals, status: int, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    words = ["run", "sim:room?frames=2000", "--in-process", "--size", "48x36", "--set", "section.length=3"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "vtslam.services.cli", *words, "--out", str(out)],
+        env=source_environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        wait_for(out / "sections" / "000001.vts", process)
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=_DEADLINE_S)
+    finally:
+        process.kill()
+        process.communicate()
+
+    assert process.returncode == status
+    assert "stopped early; what was done is kept" in output
+    with RunFolder.open(out) as run:
+        facts, rows = run.read_info().facts, run.read_frames()
+        poses = read_trajectory(run.trajectory_path).poses
+        in_sections = sum(run.read_section(section_id).num_frames for section_id in run.section_ids())
+    assert (facts.finished, facts.interrupted) == (False, True)
+    assert 6 <= facts.frames == len(rows) == len(poses) == in_sections < 2000
+    assert main(["eval", str(out)]) == 0

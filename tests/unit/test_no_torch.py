@@ -1,0 +1,34 @@
+"""What the CPU path imports."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from helpers.processes import source_environment
+
+
+def run_python(code: str, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], env=source_environment(), capture_output=True, text=True, check=True
+    )
+    return done.stdout
+
+
+def test_import_of_the_package_imports_nothing_else() -> None:
+    code = "import sys, vtslam; print(sorted({'numpy', 'cv2', 'torch', 'vtslam.common'} & set(sys.modules)))"
+
+    assert run_python(code).strip() == "[]"
+
+
+def test_every_public_name_is_there_and_the_cpu_path_never_imports_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys, vtslam\n"
+        "assert all(getattr(vtslam, name) is not None for name in vtslam.__all__)\n"
+        "assert set(vtslam.__all__) <= set(dir(vtslam))\n"
+        "small = ['source.size=48x36', 'source.frames=0:3', 'section.length=2']\n"
+        "vtslam.run('sim:room', sys.argv[1], assignments=small)\n"
+        "vtslam.evaluate(sys.argv[1])\n"
+        "print('torch' in sys.modules)"
+    )
+
+    assert run_python(code, str(tmp_path / "run")).strip() == "False"
