@@ -1,0 +1,412 @@
+"""Dense alignment: its normal equations against numerical derivatives, and the motions it recovers."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from helpers.smooth_room import SmoothRoom, small_camera
+
+from vtslam.common.geometry import se3
+from vtslam.common.optim import _align
+from vtslam.common.optim.alignment import (
+    Alignment,
+    ObservedLevel,
+    ReferenceLevel,
+    align,
+    observed_pyramid,
+    reference_pyramid,
+)
+from vtslam.common.settings import GaussNewtonSettings
+from vtslam.common.splat.engine import Rendering
+
+Array = npt.NDArray[np.float64]
+
+CAMERA = small_camera()
+SETTINGS = GaussNewtonSettings(levels=3, iterations=10, color_sigma=0.03, depth_sigma_base_m=0.002)
+START = se3.exp(np.array([0.2, -0.1, 0.3, 0.1, 0.4, -0.2]))
+
+
+def motion(seed: int, *, metres: float, degrees: float) -> Array:
+    """A motion of this length and angle in random directions."""
+    rng = np.random.default_rng(seed)
+    rho, phi = rng.normal(size=3), rng.normal(size=3)
+    return se3.exp(
+        np.concatenate([rho * metres / np.linalg.norm(rho), phi * np.radians(degrees) / np.linalg.norm(phi)])
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Equations:
+    H: Array
+    g: Array
+    color_cost: float
+    depth_cost: float
+    visible: int
+
+    @property
+    def cost(self) -> float:
+        return self.color_cost + self.depth_cost
+
+
+def equations(
+    reference: ReferenceLevel,
+    observed: ObservedLevel,
+    T: Array,
+    *,
+    color_weight: float = 1.0,
+    depth_weight: float = 1.0,
+    gate_sigmas: float = 100.0,
+    color_sigma: float = 0.03,
+    threads: int = 1,
+) -> Equations:
+    options = _align.AlignmentOptions(
+        color_sigma=color_sigma,
+        color_weight=color_weight,
+        depth_sigma_base=0.002,
+        depth_sigma_quadratic=0.0015,
+        depth_weight=depth_weight,
+        depth_gate_sigmas=gate_sigmas,
+        border_px=1.0,
+    )
+    camera = reference.camera
+    H, g, color_cost, depth_cost, _, _, visible = _align.normal_equations(
+        reference.rgb,
+        reference.depth_m,
+        reference.normals,
+        reference.mask,
+        observed.packed,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        np.ascontiguousarray(T),
+        options,
+        threads,
+    )
+    return Equations(H=H, g=g, color_cost=color_cost, depth_cost=depth_cost, visible=visible)
+
+
+def reference_of(rendering: Rendering, *, margin: int = 0) -> ReferenceLevel:
+    """The finest level; a margin keeps warped pixels away from the image's border."""
+    level = reference_pyramid(rendering, CAMERA, 1, silhouette_threshold=0.9)[0]
+    mask = level.mask.copy()
+    if margin:
+        mask[:margin], mask[-margin:], mask[:, :margin], mask[:, -margin:] = 0, 0, 0, 0
+    return replace(level, mask=mask)
+
+
+def observed_of(room: SmoothRoom, T_world_camera: Array) -> ObservedLevel:
+    return observed_pyramid(*room.view(T_world_camera, CAMERA), CAMERA, 1)[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("color_weight", "depth_weight"), [(1.0, 0.0), (0.0, 1.0), (0.7, 1.3)])
+def test_gradient_is_the_derivative_of_the_robust_cost(seed: int, color_weight: float, depth_weight: float) -> None:
+    room = SmoothRoom(seed=seed)
+    reference = reference_of(room.rendering(START, CAMERA), margin=6)
+    # Large enough that some residuals are in the linear part of the Huber cost, and some are not.
+    observed = observed_of(room, START @ motion(seed, metres=0.02, degrees=1.0))
+
+    def at(T: Array) -> Equations:
+        return equations(reference, observed, T, color_weight=color_weight, depth_weight=depth_weight)
+
+    here = at(np.eye(4))
+    numeric = np.zeros(6)
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 2e-4
+        numeric[axis] = (at(se3.exp(step)).cost - at(se3.exp(-step)).cost) / 4e-4
+    assert here.visible > 1500
+    assert np.linalg.norm(here.g - numeric) < 0.04 * np.linalg.norm(numeric)
+    for part in (slice(0, 3), slice(3, 6)):
+        assert np.linalg.norm(here.g[part] - numeric[part]) < 0.05 * np.linalg.norm(numeric[part])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("color_weight", "depth_weight"), [(1.0, 0.0), (0.0, 1.0), (0.7, 1.3)])
+def test_information_is_the_curvature_of_the_cost_at_its_minimum(
+    seed: int, color_weight: float, depth_weight: float
+) -> None:
+    room = SmoothRoom(seed=seed)
+    true = motion(seed + 10, metres=0.01, degrees=0.5)
+    reference, observed = reference_of(room.rendering(START, CAMERA), margin=6), observed_of(room, START @ true)
+    T = se3.inverse(true)
+
+    def at(step: Array) -> Equations:
+        # A wide colour scale keeps all residuals of this test in the quadratic part.
+        weights = {"color_weight": color_weight, "depth_weight": depth_weight}
+        return equations(reference, observed, se3.exp(step) @ T, color_sigma=0.1, **weights)
+
+    here = at(np.zeros(6))
+    np.testing.assert_array_equal(here.H, here.H.T)
+    steps = np.random.default_rng(seed).normal(size=(12, 6)) * np.array([2e-3] * 3 + [1e-3] * 3)
+    curvature = np.array([at(step).cost + at(-step).cost - 2.0 * here.cost for step in steps])
+    expected = np.einsum("ni,ij,nj->n", steps, here.H, steps)
+    # Along the surface the nearest pixel changes while the distance to the plane hardly does.
+    np.testing.assert_allclose(curvature, expected, rtol=0.15)
+    assert curvature.sum() == pytest.approx(expected.sum(), rel=0.03)
+
+
+def test_robust_weight_falls_with_the_inverse_of_the_residual() -> None:
+    room = SmoothRoom(seed=1)
+    observed = observed_of(room, START)
+    reference = reference_of(room.rendering(START, CAMERA))
+    plain = equations(reference, observed, np.eye(4), depth_weight=0.0)
+    shifted = replace(reference, rgb=reference.rgb - np.float32(4 * 0.03))
+    robust = equations(shifted, observed, np.eye(4), depth_weight=0.0)
+    np.testing.assert_allclose(robust.H, plain.H / 4.0, rtol=1e-4, atol=1e-5 * np.abs(plain.H).max())
+    assert robust.color_cost == pytest.approx(plain.color_cost + 3 * plain.visible * (4.0 - 0.5), rel=1e-4)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 4, 16, 50])
+def test_threads_do_not_change_a_byte(threads: int) -> None:
+    room = SmoothRoom(seed=2)
+    reference, observed = reference_of(room.rendering(START, CAMERA)), observed_of(room, START)
+    T = motion(3, metres=0.02, degrees=2.0)
+    one, many = equations(reference, observed, T), equations(reference, observed, T, threads=threads)
+    assert one.H.tobytes() == many.H.tobytes()
+    assert one.g.tobytes() == many.g.tobytes()
+    assert (one.cost, one.visible) == (many.cost, many.visible)
+
+
+def test_pixels_outside_the_masks_do_not_count() -> None:
+    room = SmoothRoom(seed=3)
+    reference, observed = reference_of(room.rendering(START, CAMERA)), observed_of(room, START)
+    T = motion(1, metres=0.01, degrees=1.0)
+    left = np.zeros_like(reference.mask)
+    left[:, :30] = 1
+    everything = equations(reference, observed, T)
+    parts = [equations(replace(reference, mask=mask), observed, T) for mask in (left, (1 - left).astype(np.uint8))]
+    assert all(part.visible > 500 for part in parts)
+    assert sum(part.visible for part in parts) == everything.visible
+    np.testing.assert_allclose(parts[0].H + parts[1].H, everything.H, rtol=1e-12)
+    np.testing.assert_allclose(parts[0].g + parts[1].g, everything.g, rtol=1e-9)
+    # A frame's pixels without depth are left out in the same way.
+    packed = observed.packed.copy()
+    packed[:, 30:, 9] = 0.0
+    holes = equations(reference, replace(observed, packed=packed), np.eye(4))
+    masked = equations(replace(reference, mask=left), observed, np.eye(4))
+    assert holes.visible == masked.visible
+    np.testing.assert_allclose(holes.H, masked.H, rtol=1e-12)
+
+
+def test_a_surface_that_only_the_frame_sees_is_gated() -> None:
+    room = SmoothRoom(seed=4)
+    reference, observed = reference_of(room.rendering(START, CAMERA)), observed_of(room, START)
+    packed = observed.packed.copy()
+    packed[10:20, 20:40, 9] -= 0.4  # something stands in front
+    packed[10:20, 20:40, 0:3] = 0.0
+    occluded = equations(reference, replace(observed, packed=packed), np.eye(4), gate_sigmas=10.0)
+    mask = reference.mask.copy()
+    mask[10:20, 20:40] = 0
+    without = equations(replace(reference, mask=mask), observed, np.eye(4), gate_sigmas=10.0)
+    assert occluded.visible == without.visible
+    np.testing.assert_allclose(occluded.H, without.H, rtol=1e-12)
+    assert occluded.cost == pytest.approx(without.cost, abs=1e-6)
+
+
+@pytest.mark.parametrize("empty", ["reference", "frame", "behind"])
+def test_nothing_in_common_gives_zero_equations(empty: str) -> None:
+    room = SmoothRoom(seed=5)
+    reference, observed = reference_of(room.rendering(START, CAMERA)), observed_of(room, START)
+    T = np.eye(4)
+    if empty == "reference":
+        reference = replace(reference, mask=np.zeros_like(reference.mask))
+    elif empty == "frame":
+        observed = replace(observed, packed=np.zeros_like(observed.packed))
+    else:
+        T[2, 3] = -50.0
+    found = equations(reference, observed, T)
+    assert (found.visible, found.cost) == (0, 0.0)
+    assert not found.H.any()
+    assert not found.g.any()
+
+
+def test_misshapen_images_are_refused() -> None:
+    room = SmoothRoom()
+    reference, observed = reference_of(room.rendering(START, CAMERA)), observed_of(room, START)
+    with pytest.raises(ValueError, match="packed: wrong shape"):
+        equations(reference, replace(observed, packed=np.ascontiguousarray(observed.packed[:-1])), np.eye(4))
+    with pytest.raises(ValueError, match="mask: wrong shape"):
+        equations(replace(reference, mask=np.ones((3, 3), np.uint8)), observed, np.eye(4))
+
+
+def test_normals_are_those_of_the_surface_and_zero_where_unknown() -> None:
+    room = SmoothRoom()
+    _, depth_m = room.view(START, CAMERA)
+    depth_m[20, 30] = 0.0
+    depth_m[:, 50:] += 0.6  # a step
+    normals = _align.normals_from_depth(depth_m, (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), 0.05)
+    known = np.linalg.norm(normals, axis=-1) > 0
+    np.testing.assert_allclose(np.linalg.norm(normals[known], axis=-1), 1.0, atol=1e-5)
+    unknown = np.zeros_like(known)
+    unknown[0], unknown[-1], unknown[:, 0], unknown[:, -1] = True, True, True, True
+    unknown[20, 29:32], unknown[19:22, 30] = True, True
+    unknown[:, 49:51] = True
+    np.testing.assert_array_equal(known, ~unknown)
+    points = CAMERA.back_projected(depth_m).astype(np.float64) @ START[:3, :3].T + START[:3, 3]
+    gradient = (points / np.square(room.radii_m)) @ START[:3, :3]
+    true = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+    left = known & (np.arange(CAMERA.width) < 49)
+    cosine = np.abs((normals * true).sum(-1))[left]
+    assert cosine.min() > 0.999
+
+
+def aligned(
+    room: SmoothRoom,
+    true: Array,
+    *,
+    prior: tuple[Array, Array] | None = None,
+    threads: int = 1,
+    coarsest: int = 2,
+    settings: GaussNewtonSettings = SETTINGS,
+) -> Alignment:
+    reference = reference_pyramid(room.rendering(START, CAMERA), CAMERA, coarsest + 1, silhouette_threshold=0.9)
+    observed = observed_pyramid(*room.view(START @ true, CAMERA), CAMERA, coarsest + 1)
+    return align(
+        reference,
+        observed,
+        settings,
+        T_observed_reference=np.eye(4),
+        prior=prior,
+        coarsest=coarsest,
+        threads=threads,
+    )
+
+
+def error_of(found: Alignment, true: Array) -> tuple[float, float]:
+    error = found.T_observed_reference @ true
+    return float(np.linalg.norm(error[:3, 3])), float(np.degrees(se3.angle_rad(error)))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_hand_held_motions_are_recovered(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = motion(seed, metres=float(rng.uniform(0.01, 0.03)), degrees=float(rng.uniform(1.0, 3.0)))
+    found = aligned(SmoothRoom(seed=seed), true)
+    metres, degrees = error_of(found, true)
+    assert found.solved
+    assert found.visible_share > 0.7
+    assert metres < 0.0005
+    assert degrees < 0.02
+    assert np.linalg.eigvalsh(found.information).min() > 0
+
+
+@pytest.mark.parametrize(("color_weight", "depth_weight"), [(1.0, 0.0), (1.0, 1.0)])
+def test_each_term_is_enough_where_it_sees_the_motion(color_weight: float, depth_weight: float) -> None:
+    true = motion(11, metres=0.02, degrees=1.5)
+    settings = replace(SETTINGS, color_weight=color_weight, depth_weight=depth_weight)
+    metres, degrees = error_of(aligned(SmoothRoom(seed=7), true, settings=settings), true)
+    assert metres < 0.002
+    assert degrees < 0.05
+
+
+def test_alignment_does_not_depend_on_threads() -> None:
+    true = motion(12, metres=0.02, degrees=2.0)
+    one, four = aligned(SmoothRoom(seed=8), true), aligned(SmoothRoom(seed=8), true, threads=4)
+    assert one.T_observed_reference.tobytes() == four.T_observed_reference.tobytes()
+    assert one.information.tobytes() == four.information.tobytes()
+
+
+@pytest.mark.parametrize("information", [1e-6, 1e12])
+def test_a_prior_pulls_as_its_information_says(information: float) -> None:
+    room, true = SmoothRoom(seed=9), motion(13, metres=0.02, degrees=1.5)
+    wrong = motion(14, metres=0.03, degrees=1.0)
+    found = aligned(room, true, prior=(wrong, information * np.eye(6)))
+    if information < 1.0:
+        free = aligned(room, true)
+        np.testing.assert_allclose(found.T_observed_reference, free.T_observed_reference, atol=1e-6)
+    else:
+        np.testing.assert_allclose(found.T_observed_reference, wrong, atol=1e-6)
+    assert found.solved
+
+
+def test_a_prior_on_one_direction_leaves_the_others_free() -> None:
+    room, true = SmoothRoom(seed=9), motion(13, metres=0.02, degrees=1.5)
+    free = aligned(room, true).T_observed_reference
+    offset = np.array([0.01, 0, 0, 0, 0, 0])
+    information = np.zeros((6, 6))
+    information[0, 0] = 1e10
+    found = aligned(room, true, prior=(se3.exp(offset) @ free, information)).T_observed_reference
+    error = se3.log(found @ se3.inverse(se3.exp(offset) @ free))
+    assert abs(error[0]) < 1e-5
+    assert np.linalg.norm(error[1:]) > 1e-4
+
+
+def test_a_prior_between_two_estimates_lands_between_them() -> None:
+    room, true = SmoothRoom(seed=9), motion(13, metres=0.02, degrees=1.5)
+    free = aligned(room, true)
+    offset = np.array([0.002, -0.001, 0.0015, 0.0005, 0.001, -0.0005])
+    # As sure as the images, and 2 mm away: the answer lies half way.
+    prior = (se3.exp(offset) @ free.T_observed_reference, free.information)
+    found = aligned(room, true, prior=prior).T_observed_reference
+    half = se3.log(found @ se3.inverse(free.T_observed_reference))
+    assert half == pytest.approx(0.5 * offset, abs=0.15 * float(np.abs(offset).max()))
+
+
+def test_too_few_pixels_are_called_unsolved_and_keep_the_guess() -> None:
+    room = SmoothRoom()
+    reference = reference_pyramid(room.rendering(START, CAMERA), CAMERA, 1, silhouette_threshold=0.9)
+    mask = np.zeros_like(reference[0].mask)
+    mask[20, 20:40] = 1
+    observed = observed_pyramid(*room.view(START, CAMERA), CAMERA, 1)
+    guess = motion(1, metres=0.001, degrees=0.1)
+    found = align(
+        [replace(reference[0], mask=mask)], observed, SETTINGS, T_observed_reference=guess, coarsest=0, threads=1
+    )
+    assert not found.solved
+    np.testing.assert_array_equal(found.T_observed_reference, guess)
+    assert found.visible_share == 20 / mask.size
+
+
+def test_a_flat_grey_wall_does_not_break_the_solver() -> None:
+    rgb, depth_m = np.full((48, 64, 3), 0.5, np.float32), np.full((48, 64), 2.0, np.float32)
+    rendering = Rendering(rgb=rgb, depth_m=depth_m, alpha=np.ones_like(depth_m), saved=None)
+    found = align(
+        reference_pyramid(rendering, CAMERA, 1, silhouette_threshold=0.9),
+        observed_pyramid(rgb, depth_m - np.float32(0.01), CAMERA, 1),
+        SETTINGS,
+        T_observed_reference=np.eye(4),
+        coarsest=0,
+    )
+    assert np.isfinite(found.T_observed_reference).all()
+    np.testing.assert_allclose(found.T_observed_reference[:3, 3], [0, 0, -0.01], atol=1e-4)
+
+
+def test_pyramids_halve_images_and_camera_and_drop_uncertain_pixels() -> None:
+    rng = np.random.default_rng(0)
+    camera = small_camera(13, 9)
+    rgb = rng.random((9, 13, 3)).astype(np.float32)
+    depth_m = np.full((9, 13), 2.0, np.float32)
+    depth_m[0, 0] = 0.0  # a hole
+    depth_m[2:4, 2] = 3.0  # a step
+    alpha = np.ones((9, 13), np.float32)
+    alpha[4, 4] = 0.2
+    coarse = observed_pyramid(rgb, depth_m, camera, 2)[1]
+    assert (coarse.camera.width, coarse.camera.height, coarse.packed.shape) == (6, 4, (4, 6, 10))
+    assert (coarse.camera.fx, coarse.camera.cy) == (camera.fx / 2, camera.cy / 2)
+    np.testing.assert_allclose(coarse.packed[1, 2, :3], rgb[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
+    expected = np.full((4, 6), 2.0)
+    expected[0, 0], expected[1, 1] = 0.0, 0.0
+    np.testing.assert_array_equal(coarse.packed[..., 9], expected)
+    rendering = Rendering(rgb=rgb * alpha[..., None], depth_m=depth_m * alpha, alpha=alpha, saved=None)
+    fine, half = reference_pyramid(rendering, camera, 2, silhouette_threshold=0.5)
+    assert fine.mask[4, 4] == 0
+    assert fine.mask.sum() == 9 * 13 - 1
+    assert half.mask[2, 2] == 0
+    assert half.mask.sum() == 23
+
+
+def test_a_half_covered_view_is_divided_by_its_silhouette() -> None:
+    rgb, depth_m = np.full((9, 13, 3), 0.6, np.float32), np.full((9, 13), 2.0, np.float32)
+    alpha = np.full((9, 13), 0.8, np.float32)
+    rendering = Rendering(rgb=rgb * alpha[..., None], depth_m=depth_m * alpha, alpha=alpha, saved=None)
+    level = reference_pyramid(rendering, small_camera(13, 9), 1, silhouette_threshold=0.5)[0]
+    np.testing.assert_allclose(level.rgb, rgb, rtol=1e-6)
+    np.testing.assert_allclose(level.depth_m, depth_m, rtol=1e-6)
+
+
+def test_image_gradients_are_per_pixel() -> None:
+    v, u = np.mgrid[0:9, 0:13].astype(np.float32)
+    rgb = np.stack([0.01 * u, 0.02 * v, 0.03 * u - 0.01 * v], axis=-1)
+    packed = observed_pyramid(rgb, np.ones((9, 13), np.float32), small_camera(13, 9), 1)[0].packed[1:-1, 1:-1]
+    np.testing.assert_allclose(packed[..., 3:6], np.broadcast_to([0.01, 0.0, 0.03], (7, 11, 3)), atol=1e-6)
+    np.testing.assert_allclose(packed[..., 6:9], np.broadcast_to([0.0, 0.02, -0.01], (7, 11, 3)), atol=1e-6)
