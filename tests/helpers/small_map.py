@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +38,7 @@ def room_frame(index: int, frames: int = 24, size: tuple[int, int] = SIZE) -> Fr
 def room_pose(index: int, frames: int = 24, size: tuple[int, int] = SIZE) -> Pose:
     """Its true pose ``T_world_camera`` [4,4], in a world whose origin is frame 0."""
     poses = _room(frames, size).ground_truth()
-    return se3.inverse(poses[0]) @ poses[index]
+    return np.asarray(se3.inverse(poses[0]) @ poses[index], np.float64)
 
 
 def without_depth(frame: Frame) -> Frame:
@@ -120,7 +121,7 @@ class FixedMap:
 
 def section_bytes(section: Section) -> bytes:
     """All that a section is, as bytes."""
-    arrays = [section.T_world_section, section.means_m]
+    arrays: list[npt.NDArray[Any]] = [section.T_world_section, section.means_m]
     gaussians = section.gaussians
     arrays += [gaussians.frame_index, gaussians.pixel, gaussians.subpixel, gaussians.depth]
     arrays += [gaussians.colors, gaussians.log_radii, gaussians.opacity_logits]

@@ -132,8 +132,14 @@ def test_information_is_the_curvature_of_the_cost_at_its_minimum(
 
     def at(step: Array) -> Equations:
         # A wide colour scale keeps all residuals of this test in the quadratic part.
-        weights = {"color_weight": color_weight, "depth_weight": depth_weight}
-        return equations(reference, observed, se3.exp(step) @ T, color_sigma=0.1, **weights)
+        return equations(
+            reference,
+            observed,
+            se3.exp(step) @ T,
+            color_weight=color_weight,
+            depth_weight=depth_weight,
+            color_sigma=0.1,
+        )
 
     here = at(np.zeros(6))
     np.testing.assert_array_equal(here.H, here.H.T)
