@@ -5,6 +5,7 @@ import os
 from vtslam.common.config import ConfigError
 from vtslam.common.settings import SplatSettings
 from vtslam.common.splat.engine import Engine, RasterSettings
+from vtslam.services.process_facts import package_version
 
 
 def thread_count(settings: SplatSettings) -> int:
@@ -23,6 +24,16 @@ def make_engine(settings: SplatSettings) -> Engine:
         return _made(settings, raster)
     except (ImportError, ValueError, RuntimeError) as error:
         raise ConfigError(f"splat.engine = {settings.engine}: {error}") from error
+
+
+def engine_versions(settings: SplatSettings) -> dict[str, str]:
+    """By name, what the chosen engine's results depend on beside the settings."""
+    if settings.engine == "native":
+        from vtslam.common.splat import _native
+
+        return {"simd": _native.simd()}
+    packages = ("torch", "gsplat") if settings.engine == "gsplat" else ("torch",)
+    return {name: package_version(name) for name in packages}
 
 
 def _made(settings: SplatSettings, raster: RasterSettings) -> Engine:

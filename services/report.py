@@ -35,6 +35,8 @@ def write_report(run: RecordedRun, values: Mapping[str, Any]) -> dict[str, objec
     """
     folder = run.folder.path / _PICTURES
     folder.mkdir(exist_ok=True)
+    for earlier in folder.glob("frame-*.png"):  # another run's, which may have shown other frames
+        earlier.unlink()
     strips = {f"frame-{frame_id:06d}.png": _strip(run, frame_id) for frame_id in _shown_frames(run)}
     plot, sheet = _trajectory(run), in_columns(list(strips.values()), 2)
     pictures = {"overview.png": stacked([plot, sheet]), "trajectory.png": plot, **strips}

@@ -8,7 +8,7 @@ from vtslam.common.config import to_dict
 from vtslam.common.preset_loading import load_settings
 from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
-from vtslam.services.engines import make_engine
+from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.process_facts import program_version, versions
 from vtslam.services.recording_run import FrameFacts, RunSummary, run_recording
 from vtslam.services.sensor.sources.base import Source
@@ -74,7 +74,8 @@ class RunPlan:
             first_frame=0,
             end_frame=len(self.source),
         )
-        return RunInfo(facts=facts, settings=to_dict(self.settings), versions=versions())
+        found = {**versions(), **engine_versions(self.settings.splat)}
+        return RunInfo(facts=facts, settings=to_dict(self.settings), versions=found)
 
 
 def plan_run(

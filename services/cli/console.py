@@ -10,6 +10,7 @@ from typing import Any, Self, TextIO
 from tqdm import tqdm
 
 from vtslam.common.config import ConfigError
+from vtslam.storage.errors import WriteFailed
 
 _LINE_INTERVAL_S = 5.0
 
@@ -35,7 +36,7 @@ class Console:
         print(text, file=self.text, flush=True)
 
     def result(self, values: dict[str, Any]) -> None:
-        """The result as JSON, if it was asked for."""
+        """The result as JSON, if it was asked for; raises WriteFailed."""
         if self._json_target is None:
             return
         text = json.dumps(values, indent=1, allow_nan=False)
@@ -45,7 +46,7 @@ class Console:
         try:
             Path(self._json_target).write_text(f"{text}\n", encoding="utf-8")
         except OSError as error:
-            raise ConfigError(f"--json {self._json_target}: cannot write: {error.strerror}") from error
+            raise WriteFailed(f"--json {self._json_target}: cannot write: {error.strerror}") from error
 
 
 class Progress:

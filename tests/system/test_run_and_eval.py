@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from helpers.recordings import cut_in_half, write_replica
 
+from vtslam.common import metrics
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
+from vtslam.services.evaluation import evaluate_run
+from vtslam.services.recorded_run import RecordedRun
 from vtslam.storage.run_folder import RunFolder
 
 FRAMES, LENGTH, HOLDOUT = 12, 5, 2
@@ -101,9 +104,9 @@ def test_held_out_frames_leave_nothing_in_the_map(room_run: Path) -> None:
     assert not set(np.unique(record.frame_index)) & {2, 4}
 
 
-def test_a_second_run_gives_the_same_bytes(room_run: Path, tmp_path: Path) -> None:
+def test_a_second_run_gives_the_same_bytes_with_other_threads_too(room_run: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
-    assert run_room(again) == 0
+    assert run_room(again, "--set", "splat.threads=3") == 0
 
     names = ["trajectory.txt", *(f"sections/{i:06d}.vts" for i in range(3))]
     assert [(again / name).read_bytes() for name in names] == [(room_run / name).read_bytes() for name in names]
@@ -121,12 +124,27 @@ def test_eval_writes_the_defined_figures_and_no_others(room_run: Path, capsys: p
     assert [frame["frame"] for frame in values["per_frame"]] == [0, 5, 10]
     assert [frame["section"] for frame in values["per_frame"]] == [0, 1, 2]
     assert (values["frames"], values["sections"]) == (FRAMES, 3)
+    assert values["gaussians"] == loaded(room_run.parent / "summary.json")["gaussians"]
     assert values["ms_ssim_paper"] is None  # the images are too small for it
     assert values["psnr_full_db"] > 20
     assert values["psnr_heldout_db"] > 18
     assert values["ate_rmse_m"] < 0.05
     assert values["seam_db"] == pytest.approx(values["psnr_last_db"] - values["psnr_next_db"])
     assert any(line.split()[:1] == ["ate_rmse_m"] for line in printed.err.splitlines())
+
+
+def test_seams_are_seen_from_the_section_that_ends(room_run: Path) -> None:
+    run = RecordedRun(room_run)
+    next_db, last_db = [], []
+    for section_id, last, following in ((0, range(0, 5), range(5, 10)), (1, range(5, 10), range(10, 12))):
+        section = run.section(section_id)
+        db = {i: metrics.seam_psnr_db(run.render(section, i), run.frame(i)) for i in (*last, *following)}
+        next_db.append(np.mean([db[i] for i in following]))
+        last_db.append(np.mean([db[i] for i in last]))
+
+    values = evaluate_run(run)
+    assert values["psnr_next_db"] == pytest.approx(np.mean(next_db))
+    assert values["psnr_last_db"] == pytest.approx(np.mean(last_db))
 
 
 def test_an_existing_run_is_kept_unless_overwriting_is_asked_for(

@@ -8,9 +8,9 @@ from helpers.processes import source_environment
 
 
 def run_python(code: str, *words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], env=source_environment(), capture_output=True, text=True, check=True
-    )
+    words = (sys.executable, "-c", code, *words)
+    done = subprocess.run(words, env=source_environment(), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     return done.stdout
 
 
