@@ -40,9 +40,9 @@ def margin(
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     inside = min(u - border_px, v - border_px, camera.width - border_px - u, camera.height - border_px - v)
     if inside < 0:
-        return inside
+        return float(inside)
     measured = bilinear(depth, u - 0.5, v - 0.5) * UNIT_M
-    return min(inside, tolerance - abs(measured - z) / max(min(measured, z), 1e-12))
+    return float(min(inside, tolerance - abs(measured - z) / max(min(measured, z), 1e-12)))
 
 
 @given(
