@@ -60,7 +60,7 @@ def book_row(scene: SceneBuilder, start: Vector, length: float, room: float, rng
 
 def book_colour(rng: Rng) -> Colour:
     """A muted or strong cover colour."""
-    r, g, b = rng.uniform(0.3, 1.25, 3).tolist()
+    r, g, b = rng.uniform(0.35, 1.05, 3).tolist()
     return r, g, b
 
 

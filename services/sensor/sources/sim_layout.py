@@ -18,7 +18,7 @@ _CARTONS: tuple[tuple[Vector, Vector, float], ...] = (  # centre, size, turn in 
 
 
 def furnished_room(seed: int, *, num_threads: int) -> Scene:
-    """The room for a seed: the same furniture, other colours, patterns, books and prints."""
+    """The room for a seed: the same furniture with other grain, books, prints and leaves."""
     brush = Brush(seed, num_threads=num_threads)
     scene = SceneBuilder(_materials(brush))
     _shell(scene)
@@ -37,7 +37,7 @@ def _materials(brush: Brush) -> dict[str, Material]:
         "planks": materials.planks(brush),
         "brick": materials.brick(brush),
         "oak": materials.wood(brush, "oak", (0.42, 0.26, 0.13), (0.86, 0.66, 0.42)),
-        "walnut": materials.wood(brush, "walnut", (0.16, 0.09, 0.05), (0.56, 0.36, 0.21)),
+        "walnut": materials.wood(brush, "walnut", (0.17, 0.1, 0.06), (0.62, 0.41, 0.25)),
         "warm paper": materials.wallpaper(brush, "warm", (0.9, 0.82, 0.66), (0.62, 0.4, 0.26), (0.4, 0.5, 0.36)),
         "blue paper": materials.wallpaper(brush, "blue", (0.68, 0.76, 0.82), (0.24, 0.36, 0.54), (0.84, 0.8, 0.62)),
         "plaster": materials.plaster(brush, "plaster", (0.62, 0.6, 0.56), (0.98, 0.96, 0.92)),
@@ -51,6 +51,7 @@ def _materials(brush: Brush) -> dict[str, Material]:
         "shapes": prints.shapes_poster(brush, "shapes"),
         "news": prints.page_poster(brush, "news", paper=(0.9, 0.88, 0.8), ink=(0.1, 0.1, 0.12), columns=3),
         "landscape": prints.landscape(brush, "landscape"),
+        "view": prints.landscape(brush, "view"),
         "map": prints.land_map(brush, "map"),
         "screen": prints.screen(brush),
         "keyboard": prints.keyboard(brush),
@@ -123,7 +124,7 @@ def _side_walls(scene: SceneBuilder, brush: Brush) -> None:
     furniture.framed(scene, (wide, 1.95, 1.62), "-x", (1.1, 0.72), "landscape", walnut)
     scene.cone((wide - 0.02, 3.1, 1.75), (0.17, 0.17), 0.04, _clock(), turned(pitch_deg=-90.0))
     # The window: a bright view behind bars, curtains at both sides, a heater below.
-    scene.box((0.015, 2.0, 1.55), (0.03, 1.3, 1.2), Finish(material="landscape", stretch=(1.3, 1.2), glow=0.7))
+    scene.box((0.015, 2.0, 1.55), (0.03, 1.3, 1.2), Finish(material="view", stretch=(1.3, 1.2), glow=0.4))
     for y in (1.33, 2.0, 2.67):
         scene.box((0.03, y, 1.55), (0.06, 0.05, 1.3), oak)
     for z in (0.93, 1.55, 2.17):
@@ -133,7 +134,11 @@ def _side_walls(scene: SceneBuilder, brush: Brush) -> None:
     furniture.curtain(scene, (0.1, 2.7, 0.12), (0.1, 3.15, 0.12), 2.2, cloth)
     scene.cone((0.1, 2.0, 2.34), (0.018, 0.018), 2.6, walnut, turned(roll_deg=90.0))
     for k in range(12):
-        scene.box((0.1, 1.48 + 0.095 * k, 0.48), (0.09, 0.07, 0.6), Finish(material="plaster", shift=(0.1 * k, 0.3)))
+        scene.box(
+            (0.1, 1.48 + 0.095 * k, 0.48),
+            (0.09, 0.07, 0.6),
+            Finish(material="plaster", tint=(0.75, 0.75, 0.72), shift=(0.1 * k, 0.3)),
+        )
     furniture.potted_plant(scene, (0.45, 3.4, 0.0), Finish(material="brick"), Finish(material="leaves"), walnut, rng)
     furniture.chair(scene, (0.62, 0.62, 0.0), 45.0, Finish(material="linen"), oak)
     furniture.book_pile(scene, (0.62, 0.62, 0.48), 2, rng)

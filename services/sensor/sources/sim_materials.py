@@ -34,7 +34,7 @@ class Brush:
     def grain(self, size: tuple[int, int], name: str) -> Plane:
         """Equal strength in all octaves from 32 down to 2 texels: detail at every distance of view."""
         if size not in self._grain:
-            self._grain[size] = self.noise(size, (size[0] // 32, size[1] // 32), 5, 1.0, f"grain {size}") * np.float32(
+            self._grain[size] = self.noise(size, (size[0] // 16, size[1] // 16), 4, 1.35, f"grain {size}") * np.float32(
                 0.45
             )
         shift = self.rng(name).integers(0, 1 << 16, 2)
@@ -72,7 +72,7 @@ def wood(brush: Brush, name: str, dark: Colour, light: Colour, *, contrast: floa
     size = (512, 512)
     fibres = brush.noise(size, (64, 6), 3, 0.9, name + " fibres")
     rings = _wave(_grid(size)[0] + 9.0 * brush.noise(size, (4, 2), 3, 0.5, name + " rings"), 512.0 / 14.0)
-    weight = 0.5 + contrast * (0.1 * fibres + 0.3 * (rings - 0.5) + 0.09 * brush.grain(size, name))
+    weight = 0.5 + contrast * (0.1 * fibres + 0.3 * (rings - 0.5) + 0.18 * brush.grain(size, name))
     return material(blend(dark, light, weight))
 
 
@@ -82,13 +82,13 @@ def planks(brush: Brush) -> Material:
     rng = brush.rng("planks")
     v, u = _grid(size)
     row = np.broadcast_to((v / (size[0] / rows)).astype(np.intp), size)
-    start, tone = rng.uniform(0.0, 512.0, rows), rng.uniform(-0.28, 0.28, (rows, 2))
+    start, tone = rng.uniform(0.0, 512.0, rows), rng.uniform(-0.22, 0.22, (rows, 2))
     along = np.mod(u + start[row].astype(np.float32), np.float32(size[1]))
     board = (along > 560.0).astype(np.intp)
     shade = tone[row, board].astype(np.float32)
     fibres = brush.noise(size, (128, 8), 3, 0.9, "plank fibres")
     rings = _wave(v + 12.0 * brush.noise(size, (8, 3), 3, 0.5, "plank rings"), 32.0)
-    weight = 0.5 + shade + 0.085 * fibres + 0.2 * (rings - 0.5) + 0.08 * brush.grain(size, "planks")
+    weight = 0.5 + shade + 0.085 * fibres + 0.2 * (rings - 0.5) + 0.12 * brush.grain(size, "planks")
     image = blend((0.36, 0.21, 0.11), (0.80, 0.57, 0.34), weight)
     across = np.mod(v, size[0] / rows)
     seam = (np.minimum(across, size[0] / rows - across) < 1.5) | (np.abs(along - 560.0) < 1.5) | (along < 1.5)
@@ -107,7 +107,7 @@ def brick(brush: Brush) -> Material:
     wobble = 2.0 * brush.noise(size, (64, 64), 2, 0.7, "brick edge")
     from_v, from_u = np.mod(v, 64.0) + wobble, np.mod(shifted, 128.0) + wobble
     joint = (np.minimum(from_v, 64.0 - from_v) < 4.0) | (np.minimum(from_u, 128.0 - from_u) < 4.0)
-    tone = rng.uniform(-0.3, 0.3, (rows, columns)).astype(np.float32)[row, column]
+    tone = rng.uniform(-0.22, 0.22, (rows, columns)).astype(np.float32)[row, column]
     grain = brush.grain(size, "brick")
     image = blend((0.42, 0.17, 0.12), (0.82, 0.45, 0.33), 0.5 + tone + 0.14 * grain)
     image[joint] = blend((0.5, 0.47, 0.43), (0.85, 0.82, 0.76), 0.5 + 0.14 * grain)[joint]
@@ -118,7 +118,7 @@ def wallpaper(brush: Brush, name: str, ground: Colour, figure: Colour, leaf: Col
     """Wallpaper with ogee medallions and leaves on a grained ground, repeat 25.6 x 25.6 cm."""
     size, period = (512, 512), 128.0
     v, u = _grid(size)
-    image = blend(ground, figure, 0.14 + 0.15 * brush.grain(size, name) + 0.05 * _wave(u, 16.0))
+    image = blend(ground, figure, 0.18 + 0.26 * brush.grain(size, name) + 0.05 * _wave(u, 16.0))
     for half in (0.0, 0.5):
         y = np.mod(v / period + half, 1.0) - 0.5
         x = np.mod(u / period + half, 1.0) - 0.5
@@ -136,7 +136,7 @@ def wallpaper(brush: Brush, name: str, ground: Colour, figure: Colour, leaf: Col
 def plaster(brush: Brush, name: str, dark: Colour, light: Colour) -> Material:
     """Rough plaster or stone: noise of equal strength at all scales."""
     size = (512, 512)
-    weight = 0.5 + 0.19 * brush.grain(size, name) + 0.05 * brush.noise(size, (3, 3), 3, 0.8, name + " stains")
+    weight = 0.5 + 0.22 * brush.grain(size, name) + 0.05 * brush.noise(size, (3, 3), 3, 0.8, name + " stains")
     return material(blend(dark, light, weight))
 
 
@@ -147,5 +147,5 @@ def weave(brush: Brush, name: str, dark: Colour, light: Colour, *, thread: float
     over = (np.mod(u / thread, 2.0).astype(np.intp) + np.mod(v / thread, 2.0).astype(np.intp)) % 2
     threads = np.where(over == 1, _wave(u, thread), _wave(v, thread)) - 0.5
     bands = (np.mod(u / 64.0, 2.0) < 1.0).astype(np.float32) + (np.mod(v / 64.0, 2.0) < 1.0) - 1.0
-    weight = 0.5 + 0.22 * threads + check * bands + 0.1 * brush.grain(size, name)
+    weight = 0.5 + 0.22 * threads + check * bands + 0.13 * brush.grain(size, name)
     return material(blend(dark, light, weight))

@@ -42,7 +42,7 @@ def shapes_poster(brush: Brush, name: str) -> Material:
         else:
             end = (at[0] + int(rng.integers(-90, 90)), at[1] + int(rng.integers(-90, 90)))
             cv2.line(image, at, end, _colour(rng), int(rng.integers(2, 12)), cv2.LINE_AA)
-    return material(_printed(brush, image, name, contrast=0.75))
+    return material(_printed(brush, image, name, contrast=0.68))
 
 
 def page_poster(brush: Brush, name: str, *, paper: Colour, ink: Colour, columns: int = 2) -> Material:
@@ -86,9 +86,7 @@ def landscape(brush: Brush, name: str) -> Material:
     for k, (height, swing, dark, light) in enumerate(ridges):
         line = height + 0.5 * swing * brush.noise(size, (1, 3 + k), 5, 0.55, f"{name} ridge {k}")[:1]
         image = np.where((v > line)[..., None], blend(dark, light, 0.5 + 0.17 * strokes), image)
-    water = blend(
-        (0.2, 0.36, 0.5), (0.75, 0.68, 0.6), 0.4 + 0.2 * brush.noise(size, (128, 8), 3, 1.0, name + " water")
-    )
+    water = blend((0.2, 0.36, 0.5), (0.75, 0.68, 0.6), 0.4 + 0.2 * brush.noise(size, (128, 8), 3, 1.0, name + " water"))
     image = np.where((v > 0.84)[..., None], water, image)
     return material(np.asarray(image + 0.02 * strokes[..., None], np.float32))
 
@@ -152,7 +150,7 @@ def spines(brush: Brush) -> Material:
             if rng.random() < 0.4:
                 tone = int(rng.choice([60, 100, 240]))
                 cv2.line(image, (x + 3, y), (x + 12, y + int(rng.integers(0, 6))), (tone, tone, tone), 2)
-    return material(_printed(brush, image, "spines", 0.05, contrast=0.7))
+    return material(_printed(brush, image, "spines", 0.05, contrast=0.5))
 
 
 def pages(brush: Brush) -> Material:
