@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
+from vtslam.common.optim.surface import normals_from_depth
 from vtslam.common.splat.engine import Splats
 
 # Offset of a Gaussian from its pixel's centre in pixels, by ``subpixel``: 0 is the pixel itself, 1 to 4 the four
@@ -106,11 +107,26 @@ class ViewTiedGaussians:
             out[rows] = points[rows] @ T[:3, :3].T + T[:3, 3]
         return out
 
+    def normals(
+        self, camera: Camera, T_section_frames: npt.NDArray[np.float64], *, depth_unit_m: float
+    ) -> npt.NDArray[np.float32]:
+        """Unit surface normals float32 [N,3] in the section's frame; zero where a Gaussian's neighbours are unknown.
+
+        Computed per frame from the depths of the Gaussians tied to it, so a section read back has the same normals.
+        """
+        out = np.zeros((self.count, 3), np.float32)
+        for index in np.unique(self.frame_index):
+            rows = np.flatnonzero((self.frame_index == index) & (self.subpixel == 0))
+            depth_m = np.zeros(camera.width * camera.height, np.float32)
+            depth_m[self.pixel[rows]] = self.depth[rows] * depth_unit_m
+            image = normals_from_depth(depth_m.reshape(camera.height, camera.width), camera)
+            rotation = T_section_frames[index][:3, :3]
+            out[rows] = image.reshape(-1, 3)[self.pixel[rows]] @ rotation.T
+        return out
+
     def splats(self, means_m: npt.NDArray[np.float32]) -> Splats:
         """The Gaussians as a renderer takes them, with their positions already computed."""
-        return Splats(
-            means_m=means_m, colors=self.colors, log_radii=self.log_radii, opacity_logits=self.opacity_logits
-        )
+        return Splats(means_m=means_m, colors=self.colors, log_radii=self.log_radii, opacity_logits=self.opacity_logits)
 
 
 def edge_mask(rgb: npt.NDArray[np.uint8], *, low: float, high: float) -> npt.NDArray[np.bool_]:
@@ -126,6 +142,7 @@ def tied_to_frame(
     frame_index: int,
     depth_factor: float,
     opacity: float,
+    radius_factor: float = 1.0,
     edges: npt.NDArray[np.bool_] | None = None,
 ) -> ViewTiedGaussians:
     """New Gaussians at the pixels of ``mask`` that have depth (paper, section 3.2 and Eq. 3).
@@ -136,10 +153,11 @@ def tied_to_frame(
         frame_index: Row of the frame in the section's frame table.
         depth_factor: Factor on depth before placing them.
         opacity: Initial opacity, 0 to 1.
+        radius_factor: Initial sigma over depth / focal length.
         edges: bool [H,W], where four half-size Gaussians are added to the pixel's own, or None.
 
     Returns:
-        Colour as observed, sigma = depth / focal length (Eq. 3), halved for the edge supplement.
+        Colour as observed, sigma = radius_factor * depth / focal length (Eq. 3), halved for the edge supplement.
     """
     pixels = np.flatnonzero(mask & (frame.depth > 0)).astype(np.int32)
     subpixel = np.zeros(pixels.size, np.uint8)
@@ -148,7 +166,7 @@ def tied_to_frame(
         subpixel = np.concatenate([subpixel, np.tile(np.arange(1, 5, dtype=np.uint8), edge_pixels.size)])
         pixels = np.concatenate([pixels, np.repeat(edge_pixels, 4)])
     depth = frame.depth.reshape(-1)[pixels]
-    sigma_m = depth * (frame.depth_scale_m * depth_factor / frame.camera.mean_focal_px)
+    sigma_m = depth * (frame.depth_scale_m * depth_factor * radius_factor / frame.camera.mean_focal_px)
     log_radii = np.log(np.where(subpixel > 0, 0.5 * sigma_m, sigma_m)).astype(np.float32)
     logit = np.float32(np.log(opacity / (1.0 - opacity)))
     return ViewTiedGaussians(

@@ -41,6 +41,7 @@ class Section:
         frames: The frame table.
         gaussians: The Gaussians tied to those frames.
         means_m: float32 [N,3], their positions in section coordinates; recomputed from the rest, never stored.
+        normals: float32 [N,3], surface normals there (zero where unknown); recomputed likewise.
     """
 
     section_id: int
@@ -51,12 +52,28 @@ class Section:
     frames: tuple[SectionFrame, ...]
     gaussians: ViewTiedGaussians
     means_m: npt.NDArray[np.float32]
+    normals: npt.NDArray[np.float32]
 
     def retied(self) -> "Section":
-        """The section with positions computed anew from its frames' poses."""
+        """The section with positions and normals computed anew from its frames' poses."""
+        means, normals = self.surface_of(self.gaussians)
+        return replace(self, means_m=means, normals=normals)
+
+    def grown(self, new: ViewTiedGaussians) -> "Section":
+        """The section with more Gaussians, tied to frames of its table that had none."""
+        means, normals = self.surface_of(new)
+        return replace(
+            self,
+            gaussians=self.gaussians.appended(new),
+            means_m=np.concatenate([self.means_m, means]),
+            normals=np.concatenate([self.normals, normals]),
+        )
+
+    def surface_of(self, gaussians: ViewTiedGaussians) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Positions and normals, float32 [N,3] each, of Gaussians tied to this section's frames."""
         poses = np.stack([f.T_section_frame for f in self.frames]) if self.frames else np.zeros((0, 4, 4))
-        means = self.gaussians.means_m(self.camera, poses, depth_unit_m=self.depth_unit_m)
-        return replace(self, means_m=means)
+        means = gaussians.means_m(self.camera, poses, depth_unit_m=self.depth_unit_m)
+        return means, gaussians.normals(self.camera, poses, depth_unit_m=self.depth_unit_m)
 
     @property
     def depth_unit_m(self) -> float:

@@ -195,6 +195,7 @@ class MapperSettings:
         prior_weight: Pull of the attributes towards what was observed, per step.
         depth_factor: Factor on depth when Gaussians are placed.
         initial_opacity: Opacity of a new Gaussian.
+        initial_radius: Radius of a new Gaussian over depth / focal length (Eq. 3).
         edge_supplement: Add four half-size Gaussians on edge pixels.
         edge_low: Lower Canny threshold.
         edge_high: Upper Canny threshold.
@@ -218,6 +219,7 @@ class MapperSettings:
     prior_weight: NonNegative = 0.0
     depth_factor: Annotated[float, Range(0.9, 1.1)] = 1.0
     initial_opacity: Annotated[float, Range(0.01, 0.99)] = 0.5
+    initial_radius: Annotated[float, Range(0.1, 3.0)] = 1.0
     edge_supplement: bool = False
     edge_low: NonNegative = 50.0
     edge_high: NonNegative = 200.0

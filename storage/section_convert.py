@@ -65,6 +65,7 @@ def section_of(record: SectionRecord) -> Section:
         frames=frames,
         gaussians=gaussians,
         means_m=np.zeros((0, 3), np.float32),
+        normals=np.zeros((0, 3), np.float32),
     ).retied()
 
 

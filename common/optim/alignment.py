@@ -14,9 +14,10 @@ from vtslam.common.splat.engine import Rendering
 
 FloatImage = npt.NDArray[np.float32]
 
-_MAX_RELATIVE_DEPTH_STEP = 0.05  # neighbours further apart than this share no surface
+_MAX_RELATIVE_DEPTH_STEP = 0.05  # pixels further apart than this are not merged in a pyramid
+_VISIBLE_TOLERANCE = 0.03  # relative; a Gaussian this near to the rendered depth is what the view shows
 _BORDER_PX = 1.0
-_MIN_PIXELS = 30  # six unknowns need a margin
+_MIN_MEASUREMENTS = 30  # six unknowns need a margin
 _DAMPING = 1e-6  # of H's diagonal: keeps a flat wall solvable
 
 
@@ -30,13 +31,34 @@ class ObservedLevel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReferenceLevel:
-    """One pyramid level of a rendered view, seen as a textured surface."""
+    """One pyramid level of a rendered view: what each pixel shows and how far away it is."""
 
     camera: Camera
     rgb: FloatImage
     depth_m: FloatImage
-    normals: FloatImage
     mask: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """A rendered view as the frame is aligned to it.
+
+    Attributes:
+        levels: Colour pyramid, finest first.
+        points: float32 [M,6], the view-tied Gaussians it shows: position (m) and normal, rendered camera's frame.
+    """
+
+    levels: list[ReferenceLevel]
+    points: FloatImage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Observed:
+    """A frame as it is aligned: colour pyramid, finest first, and its depth image float32 [H,W] (m, 0 = left out)."""
+
+    levels: list[ObservedLevel]
+    depth_m: FloatImage
+    camera: Camera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,15 +76,13 @@ class Alignment:
     Attributes:
         T_observed_reference: float64 [4,4], from the rendered camera to the frame's.
         information: float64 [6,6], H at the solution (left twist on T_observed_reference).
-        cost: Mean robust cost per pixel, in squared sigmas.
-        visible_share: Pixels used over all pixels, at the finest level.
-        solved: Whether there were enough pixels at the finest level.
+        cost: Mean robust cost per measurement, in squared sigmas.
+        solved: Whether there were enough measurements at the finest level.
     """
 
     T_observed_reference: npt.NDArray[np.float64]
     information: npt.NDArray[np.float64]
     cost: float
-    visible_share: float
     solved: bool
 
 
@@ -85,9 +105,9 @@ def _halved_depth(depth_m: FloatImage) -> FloatImage:
     return np.where(one_surface, quads.mean(axis=0), np.float32(0)).astype(np.float32)
 
 
-def observed_pyramid(rgb: FloatImage, depth_m: FloatImage, camera: Camera, levels: int) -> list[ObservedLevel]:
-    """Pyramid of a frame, finest first: rgb float32 [H,W,3] in 0..1, depth float32 [H,W] (m, 0 = left out)."""
-    out = []
+def observed_frame(rgb: FloatImage, depth_m: FloatImage, camera: Camera, levels: int) -> Observed:
+    """A frame ready for alignment: rgb float32 [H,W,3] in 0..1, depth float32 [H,W] (m, 0 = left out)."""
+    pyramid, full_depth_m, full_camera = [], depth_m, camera
     for level in range(levels):
         if level:
             rgb, depth_m = _quads(rgb).mean(axis=0), _halved_depth(depth_m)
@@ -97,31 +117,40 @@ def observed_pyramid(rgb: FloatImage, depth_m: FloatImage, camera: Camera, level
         packed[..., 3:6] = cv2.Scharr(rgb, cv2.CV_32F, 1, 0, scale=1 / 32)
         packed[..., 6:9] = cv2.Scharr(rgb, cv2.CV_32F, 0, 1, scale=1 / 32)
         packed[..., 9] = depth_m
-        out.append(ObservedLevel(camera=camera, packed=packed))
-    return out
+        pyramid.append(ObservedLevel(camera=camera, packed=packed))
+    return Observed(levels=pyramid, depth_m=full_depth_m, camera=full_camera)
 
 
-def reference_pyramid(
-    rendering: Rendering, camera: Camera, levels: int, *, silhouette_threshold: float
-) -> list[ReferenceLevel]:
-    """Pyramid of a rendered view, finest first, colour and depth divided by the silhouette where that is high."""
+def reference_view(
+    rendering: Rendering,
+    camera: Camera,
+    T_camera_map: npt.NDArray[np.float64],
+    *,
+    means_m: FloatImage,
+    normals: FloatImage,
+    levels: int,
+    silhouette_threshold: float,
+) -> Reference:
+    """A rendered view ready for alignment, colour and depth divided by the silhouette where that is high.
+
+    Depth accumulated front to back leans towards the camera on slanted surfaces, so distances are not measured to it:
+    it only tells which Gaussians the view shows (means_m and normals float32 [N,3], map frame), and they are exact.
+    """
     covered = rendering.alpha > max(silhouette_threshold, 1e-3)
     inverse = np.where(covered, 1.0 / np.maximum(rendering.alpha, 1e-3), 0.0).astype(np.float32)
     rgb, depth_m = rendering.rgb * inverse[..., None], rendering.depth_m * inverse
+    points = _align.visible_points(
+        means_m, normals, np.ascontiguousarray(T_camera_map), depth_m, _intrinsics(camera), _VISIBLE_TOLERANCE
+    )
     mask = covered.astype(np.uint8)
-    out = []
+    pyramid = []
     for level in range(levels):
         if level:
             rgb, depth_m = _quads(rgb).mean(axis=0), _halved_depth(depth_m)
             mask = _quads(mask.astype(np.float32)).min(axis=0).astype(np.uint8)
             camera = _halved_camera(camera)
-        normals = _align.normals_from_depth(depth_m, _intrinsics(camera), _MAX_RELATIVE_DEPTH_STEP)
-        out.append(
-            ReferenceLevel(
-                camera=camera, rgb=np.ascontiguousarray(rgb), depth_m=depth_m, normals=np.asarray(normals), mask=mask
-            )
-        )
-    return out
+        pyramid.append(ReferenceLevel(camera=camera, rgb=np.ascontiguousarray(rgb), depth_m=depth_m, mask=mask))
+    return Reference(levels=pyramid, points=np.asarray(points))
 
 
 def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
@@ -133,12 +162,13 @@ class _System:
     H: npt.NDArray[np.float64]
     g: npt.NDArray[np.float64]
     mean_cost: float
-    visible: int
+    measured: int
 
 
 def _linearised(
-    reference: ReferenceLevel,
-    observed: ObservedLevel,
+    reference: Reference,
+    observed: Observed,
+    level: int,
     T: npt.NDArray[np.float64],
     settings: GaussNewtonSettings,
     prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None,
@@ -147,20 +177,24 @@ def _linearised(
     """H, g and cost at ``T``; the prior is (T_observed_reference it asks for, information)."""
     options = _align.AlignmentOptions(
         color_sigma=settings.color_sigma,
-        color_weight=settings.color_weight,
+        # A pixel of a coarse level stands for 4^level pixels, while all points count at each level.
+        color_weight=settings.color_weight * 4.0**level,
         depth_sigma_base=settings.depth_sigma_base_m,
         depth_sigma_quadratic=settings.depth_sigma_per_m,
         depth_weight=settings.depth_weight,
         depth_gate_sigmas=settings.depth_gate_sigmas,
         border_px=_BORDER_PX,
     )
-    H, g, color_cost, depth_cost, _, _, visible = _align.normal_equations(
-        reference.rgb,
-        reference.depth_m,
-        reference.normals,
-        reference.mask,
-        observed.packed,
-        _intrinsics(reference.camera),
+    view, frame = reference.levels[level], observed.levels[level]
+    H, g, color_cost, depth_cost, color_count, depth_count = _align.normal_equations(
+        view.rgb,
+        view.depth_m,
+        view.mask,
+        frame.packed,
+        _intrinsics(view.camera),
+        reference.points,
+        observed.depth_m,
+        _intrinsics(observed.camera),
         np.ascontiguousarray(T),
         options,
         threads,
@@ -169,12 +203,13 @@ def _linearised(
     if prior is not None:
         error = se3.log(T @ se3.inverse(prior[0]))
         H, g, cost = H + prior[1], g + prior[1] @ error, cost + 0.5 * float(error @ prior[1] @ error)
-    return _System(H=H, g=g, mean_cost=cost / max(visible, 1), visible=visible)
+    measured = color_count * 4**level + depth_count
+    return _System(H=H, g=g, mean_cost=cost / max(measured, 1), measured=measured)
 
 
 def align(
-    reference: list[ReferenceLevel],
-    observed: list[ObservedLevel],
+    reference: Reference,
+    observed: Observed,
     settings: GaussNewtonSettings,
     *,
     T_observed_reference: npt.NDArray[np.float64],
@@ -185,8 +220,8 @@ def align(
     """Move the frame's camera until the rendered surface agrees with the frame, from level ``coarsest`` to 0.
 
     Args:
-        reference: Pyramid of the rendered view.
-        observed: Pyramid of the frame.
+        reference: The rendered view.
+        observed: The frame.
         settings: Noise model, iterations and convergence test.
         T_observed_reference: float64 [4,4], first guess.
         prior: (pose it asks for, information [6,6]) or None.
@@ -195,39 +230,38 @@ def align(
     """
     T = T_observed_reference
     system: _System | None = None
-    for level in range(min(coarsest, len(reference) - 1, len(observed) - 1), -1, -1):
-        T, system = _solved_level(reference[level], observed[level], T, settings, prior, threads)
+    for level in range(min(coarsest, len(reference.levels) - 1, len(observed.levels) - 1), -1, -1):
+        T, system = _solved_level(reference, observed, level, T, settings, prior, threads)
     assert system is not None
-    pixels = reference[0].camera.width * reference[0].camera.height
     return Alignment(
         T_observed_reference=T,
         information=system.H,
         cost=system.mean_cost,
-        visible_share=system.visible / pixels,
-        solved=system.visible >= _MIN_PIXELS,
+        solved=system.measured >= _MIN_MEASUREMENTS,
     )
 
 
 def _solved_level(
-    reference: ReferenceLevel,
-    observed: ObservedLevel,
+    reference: Reference,
+    observed: Observed,
+    level: int,
     T: npt.NDArray[np.float64],
     settings: GaussNewtonSettings,
     prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None,
     threads: int,
 ) -> tuple[npt.NDArray[np.float64], _System]:
     """Gauss-Newton on one level; a step that raises the mean cost is halved once, then ends the level."""
-    system = _linearised(reference, observed, T, settings, prior, threads)
+    system = _linearised(reference, observed, level, T, settings, prior, threads)
     for _ in range(settings.iterations):
-        if system.visible < _MIN_PIXELS:
+        if system.measured < _MIN_MEASUREMENTS:
             break
         damped = system.H + _DAMPING * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
         step = np.asarray(-np.linalg.solve(damped, system.g), np.float64)
-        trial = _linearised(reference, observed, se3.exp(step) @ T, settings, prior, threads)
-        if trial.mean_cost > system.mean_cost or trial.visible < _MIN_PIXELS:
+        trial = _linearised(reference, observed, level, se3.exp(step) @ T, settings, prior, threads)
+        if trial.mean_cost > system.mean_cost or trial.measured < _MIN_MEASUREMENTS:
             step = 0.5 * step
-            trial = _linearised(reference, observed, se3.exp(step) @ T, settings, prior, threads)
-            if trial.mean_cost > system.mean_cost or trial.visible < _MIN_PIXELS:
+            trial = _linearised(reference, observed, level, se3.exp(step) @ T, settings, prior, threads)
+            if trial.mean_cost > system.mean_cost or trial.measured < _MIN_MEASUREMENTS:
                 break
         T, system = se3.exp(step) @ T, trial
         if np.linalg.norm(step[:3]) < settings.converged_m and np.linalg.norm(step[3:]) < settings.converged_rad:

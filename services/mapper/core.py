@@ -48,6 +48,7 @@ class Mapper:
             frames=(self._section_frame(frame, np.eye(4), 0),),
             gaussians=self._tied(frame, frame.depth > 0, 0),
             means_m=np.zeros((0, 3), np.float32),
+            normals=np.zeros((0, 3), np.float32),
         ).retied()
         view = TrainingView(frame_index=0, frame=frame)
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None)
@@ -91,7 +92,7 @@ class Mapper:
         views, added = active.views, 0
         if not held_out:
             new = self._tied(frame, self._uncovered(section, frame, T_section_frame), row)
-            section, added = self._grown(section, new), new.count
+            section, added = section.grown(new), new.count
             views = (*views, TrainingView(frame_index=row, frame=frame))
         chosen = self._random_views(frame.frame_id, len(views), self.settings.iterations_regular)
         result = self._optimised(section, neighbours, active, views, chosen)
@@ -148,6 +149,7 @@ class Mapper:
             frame_index=row,
             depth_factor=s.depth_factor,
             opacity=s.initial_opacity,
+            radius_factor=s.initial_radius,
             edges=edge_mask(frame.rgb, low=s.edge_low, high=s.edge_high) if s.edge_supplement else None,
         )
 
@@ -165,14 +167,6 @@ class Mapper:
             limit = self.settings.uncovered_depth_factor * float(np.median(error[valid]))
             uncovered |= (rendering.depth_m > depth_m) & (error > limit) & valid
         return np.asarray(uncovered)
-
-    def _grown(self, section: Section, new: ViewTiedGaussians) -> Section:
-        means = new.means_m(
-            section.camera, np.stack([f.T_section_frame for f in section.frames]), depth_unit_m=section.depth_unit_m
-        )
-        return replace(
-            section, gaussians=section.gaussians.appended(new), means_m=np.concatenate([section.means_m, means])
-        )
 
     def _random_views(self, frame_id: int, views: int, count: int) -> npt.NDArray[np.int64]:
         """Uniform choices among the section's views up to now, keyed by (seed, frame)."""

@@ -26,19 +26,26 @@ class Optimised:
     renders: int
 
 
-def new_moments(section: Section, settings: MapperSettings, *, previous: Moments | None) -> Moments:
-    """Optimiser state for a section's Gaussians; kept rows continue where they were, new rows start at zero."""
+def _moments_of(shape: tuple[int, ...], rate: float, previous: Adam | None) -> Adam:
+    """Adam's state for one attribute: a copy of the previous state with zero rows appended, or all zero."""
+    adam = Adam(shape, lr=rate, eps=_EPSILON)
+    if previous is not None:
+        kept = previous.m.shape[0]
+        adam.m[:kept], adam.v[:kept] = previous.m, previous.v
+        adam.step_count = previous.step_count
+    return adam
+
+
+def _new_moments(section: Section, settings: MapperSettings, previous: Moments | None) -> Moments:
+    """Optimiser state for a section's Gaussians; kept rows go on where they were if the settings keep moments."""
     g = section.gaussians
-    if previous is not None and settings.keep_moments:
-        return Moments(
-            colors=previous.colors.grown(g.count),
-            log_radii=previous.log_radii.grown(g.count),
-            opacity_logits=previous.opacity_logits.grown(g.count),
-        )
+    kept = previous if settings.keep_moments else None
     return Moments(
-        colors=Adam.zeros(g.colors.shape, learning_rate=settings.learning_rate_color, epsilon=_EPSILON),
-        log_radii=Adam.zeros(g.log_radii.shape, learning_rate=settings.learning_rate_log_radius, epsilon=_EPSILON),
-        opacity_logits=Adam.zeros(g.log_radii.shape, learning_rate=settings.learning_rate_opacity, epsilon=_EPSILON),
+        colors=_moments_of(g.colors.shape, settings.learning_rate_color, kept.colors if kept else None),
+        log_radii=_moments_of(g.log_radii.shape, settings.learning_rate_log_radius, kept.log_radii if kept else None),
+        opacity_logits=_moments_of(
+            g.opacity_logits.shape, settings.learning_rate_opacity, kept.opacity_logits if kept else None
+        ),
     )
 
 
@@ -55,7 +62,7 @@ class SectionOptimiser:
         moments: Moments | None,
     ) -> None:
         self._section, self._neighbours, self._engine, self._settings = section, neighbours, engine, settings
-        self._moments = new_moments(section, settings, previous=moments)
+        self._moments = _new_moments(section, settings, moments)
         g = section.gaussians
         self._colors, self._log_radii = g.colors.copy(), g.log_radii.copy()
         self._opacity_logits = g.opacity_logits.copy()

@@ -127,7 +127,7 @@ class Tracker:
             optimiser = self._optimiser(frame, section, section_id == 0, prior)
             T_guess = se3.inverse(section.T_section_camera(T_world_guess))
             if len(sections) > 1:
-                estimate = optimiser.pretrack(section.splats, mask, T_guess)
+                estimate = optimiser.pretrack(section, mask, T_guess)
                 tried.append(_Attempt(section, optimiser, estimate, estimate.T_camera_section))
             else:
                 tried.append(_Attempt(section, optimiser, None, T_guess))
@@ -136,7 +136,7 @@ class Tracker:
         chosen = min(tried, key=lambda a: a.estimate_or_none.loss.total if a.estimate_or_none else 0.0)
         if is_head and self.settings.visibility:
             mask = self._with_visibility(frame, usable, chosen)
-        estimate = chosen.optimiser.solve(chosen.section.splats, mask, chosen.T_camera_section)
+        estimate = chosen.optimiser.solve(chosen.section, mask, chosen.T_camera_section)
         first = chosen.estimate_or_none.first_loss if chosen.estimate_or_none else estimate.first_loss
         spent = estimate.renders + sum(a.estimate_or_none.renders for a in tried if a.estimate_or_none)
         estimate = PoseEstimate(

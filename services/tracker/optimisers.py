@@ -9,11 +9,12 @@ import numpy.typing as npt
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
-from vtslam.common.optim.alignment import ObservedLevel, PosePrior, align, observed_pyramid, reference_pyramid
+from vtslam.common.optim.alignment import PosePrior, align, observed_frame, reference_view
 from vtslam.common.optim.pose_adam import PoseAdam
 from vtslam.common.optim.tracking_loss import Target, TrackingLoss, tracking_loss
+from vtslam.common.section import Section
 from vtslam.common.settings import AdamSettings, GaussNewtonSettings, TrackerSettings
-from vtslam.common.splat.engine import Engine, Rendering, Splats
+from vtslam.common.splat.engine import Engine, Rendering
 
 _ADAPTIVE_SILHOUETTES = (0.990, 0.993, 0.995, 0.997, 0.999)
 _UNKNOWN = 1e6  # variance of a pose nothing was measured of
@@ -39,13 +40,13 @@ class PoseEstimate:
 
 
 class PoseOptimiser(Protocol):
-    """Finds the pose from which ``splats`` look like the frame."""
+    """Finds the pose from which ``section`` looks like the frame."""
 
-    def pretrack(self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
+    def pretrack(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
         """A short run, to compare sections."""
         ...
 
-    def solve(self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
+    def solve(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
         """The full run. ``mask`` uint8 [H,W] is the fixed part of W in Eq. 1."""
         ...
 
@@ -75,14 +76,14 @@ class _Adam:
         self._rgb, self._depth_m = frame.rgb_float(), frame.depth_m()
         self._iterations = settings.first_section_iterations if in_first_section else settings.iterations
 
-    def pretrack(self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
-        return self._descend(splats, mask, T_guess, self._settings.pretrack_iterations)
+    def pretrack(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
+        return self._descend(section, mask, T_guess, self._settings.pretrack_iterations)
 
-    def solve(self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
-        return self._descend(splats, mask, T_guess, self._iterations)
+    def solve(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
+        return self._descend(section, mask, T_guess, self._iterations)
 
     def _descend(
-        self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64], iterations: int
+        self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64], iterations: int
     ) -> PoseEstimate:
         s = self._settings
         adam = PoseAdam(T_guess, rate_rotation=s.learning_rate_rotation, rate_translation=s.learning_rate_translation)
@@ -92,7 +93,7 @@ class _Adam:
         best: tuple[TrackingLoss, npt.NDArray[np.float64]] | None = None
         for _ in range(iterations):
             T = adam.T_camera_map
-            rendering = self._engine.render(splats, self._camera, T)
+            rendering = self._engine.render(section.splats, self._camera, T)
             if first is None and s.silhouette_adaptive:
                 threshold = _adaptive_silhouette(rendering, target)
             loss, d_rgb, d_depth = tracking_loss(
@@ -153,21 +154,22 @@ class _GaussNewton:
         self._weights = settings.adam
         self._rgb, self._depth_m = frame.rgb_float(), frame.depth_m()
 
-    def pretrack(self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
-        return self._refine(splats, mask, T_guess, renders=2)
+    def pretrack(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
+        return self._refine(section, mask, T_guess, renders=2)
 
-    def solve(self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
-        return self._refine(splats, mask, T_guess, renders=self._settings.renders)
+    def solve(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
+        return self._refine(section, mask, T_guess, renders=self._settings.renders)
 
     def _refine(
-        self, splats: Splats, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64], *, renders: int
+        self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64], *, renders: int
     ) -> PoseEstimate:
         s = self._settings
-        observed = self._observed(mask)
+        masked_depth = np.where(mask > 0, self._depth_m, np.float32(0))
+        observed = observed_frame(self._rgb, masked_depth, self._camera, s.levels)
         target = Target(rgb=self._rgb, depth_m=self._depth_m, mask=mask)
         T, information, first, loss, spent = T_guess, np.zeros((6, 6)), None, None, 0
         for _ in range(renders):
-            rendering = self._engine.render(splats, self._camera, T)
+            rendering = self._engine.render(section.splats, self._camera, T)
             spent += 1
             loss, _, _ = tracking_loss(
                 rendering,
@@ -178,8 +180,14 @@ class _GaussNewton:
             )
             first = first or loss
             coarsest = s.levels - 1 if spent == 1 else 0
-            reference = reference_pyramid(
-                rendering, self._camera, coarsest + 1, silhouette_threshold=s.silhouette_threshold
+            reference = reference_view(
+                rendering,
+                self._camera,
+                T,
+                means_m=section.means_m,
+                normals=section.normals,
+                levels=coarsest + 1,
+                silhouette_threshold=s.silhouette_threshold,
             )
             alignment = align(
                 reference,
@@ -202,10 +210,6 @@ class _GaussNewton:
         return PoseEstimate(
             T_camera_section=T, covariance=_covariance(information), first_loss=first, loss=loss, renders=spent
         )
-
-    def _observed(self, mask: npt.NDArray[np.uint8]) -> list[ObservedLevel]:
-        masked_depth = np.where(mask > 0, self._depth_m, np.float32(0))
-        return observed_pyramid(self._rgb, masked_depth, self._camera, self._settings.levels)
 
     def _relative_prior(
         self, T_camera_map: npt.NDArray[np.float64]

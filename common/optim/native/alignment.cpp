@@ -46,69 +46,108 @@ inline void twist_row(const Point& p, const Point& g, float J[6]) {
   J[5] = p.x * g.y - p.y * g.x;
 }
 
-class BandSum {
- public:
-  BandSum(const ReferenceView& reference, const ObservedView& observed, int width, int height, const Pinhole& camera,
-          const double R[9], const double t[3], const AlignmentOptions& options)
-      : reference_(reference), observed_(observed), width_(width), height_(height), camera_(camera), options_(options) {
-    for (int i = 0; i < 9; ++i) R_[i] = static_cast<float>(R[i]);
-    for (int i = 0; i < 3; ++i) t_[i] = static_cast<float>(t[i]);
+struct Motion {
+  Motion(const double R_in[9], const double t_in[3]) {
+    for (int i = 0; i < 9; ++i) R[i] = static_cast<float>(R_in[i]);
+    for (int i = 0; i < 3; ++i) t[i] = static_cast<float>(t_in[i]);
   }
+  Point rotated(const Point& p) const {
+    return {R[0] * p.x + R[1] * p.y + R[2] * p.z, R[3] * p.x + R[4] * p.y + R[5] * p.z,
+            R[6] * p.x + R[7] * p.y + R[8] * p.z};
+  }
+  Point moved(const Point& p) const {
+    const Point q = rotated(p);
+    return {q.x + t[0], q.y + t[1], q.z + t[2]};
+  }
+  float R[9], t[3];
+};
+
+inline float dot(const Point& a, const Point& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+inline Point back_projected(float u, float v, float z, const Pinhole& camera) {
+  return {(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z};
+}
+
+inline float depth_sigma(float z, const AlignmentOptions& options) {
+  return options.depth_sigma_base + options.depth_sigma_quadratic * z * z;
+}
+
+// Point-to-plane distances between map points and the frame's depth image (nearest pixel).
+class DepthTerm {
+ public:
+  DepthTerm(const ReferencePoints& points, const DepthView& view, const Motion& motion, const AlignmentOptions& options)
+      : points_(points), view_(view), motion_(motion), options_(options) {}
+
+  void band(int64_t begin, int64_t end, NormalEquations& out) const {
+    for (int64_t i = begin; i < end; ++i) point(points_.packed + 6 * i, out);
+  }
+
+ private:
+  void point(const float* row, NormalEquations& out) const {
+    const Point p = motion_.moved({row[0], row[1], row[2]});
+    if (!(p.z > 0.01f)) return;
+    const float image_u = view_.camera.fx * p.x / p.z + view_.camera.cx;
+    const float image_v = view_.camera.fy * p.y / p.z + view_.camera.cy;
+    if (!(image_u >= 0.0f && image_v >= 0.0f && image_u < view_.width && image_v < view_.height)) return;
+    const int u = static_cast<int>(image_u), v = static_cast<int>(image_v);
+    const float d = view_.depth[static_cast<size_t>(v) * view_.width + u];
+    if (!(d > 0.0f)) return;
+    const Point normal = motion_.rotated({row[3], row[4], row[5]});
+    const Point q = back_projected(u + 0.5f, v + 0.5f, d, view_.camera);
+    const float distance = dot(normal, {q.x - p.x, q.y - p.y, q.z - p.z});
+    // Noise is along the ray: it shortens with the slant when measured along the normal.
+    const float slant = std::fabs(dot(normal, q)) / std::sqrt(dot(q, q));
+    const float sigma = depth_sigma(d, options_) * std::max(slant, 0.2f);
+    const float r = distance / sigma;
+    if (std::fabs(r) > options_.depth_gate_sigmas) return;
+    float J[6];
+    twist_row(p, Point{-normal.x, -normal.y, -normal.z}, J);
+    add_row(out, J, options_.depth_weight * huber_weight(r) / (sigma * sigma), distance);
+    out.depth_cost += options_.depth_weight * huber_cost(r);
+    ++out.depth_count;
+  }
+
+  ReferencePoints points_;
+  DepthView view_;
+  Motion motion_;
+  AlignmentOptions options_;
+};
+
+// Colour differences between a rendered view, warped, and one pyramid level of the frame.
+class ColorTerm {
+ public:
+  ColorTerm(const ReferenceView& reference, const ObservedView& observed, const Motion& motion,
+            const AlignmentOptions& options)
+      : reference_(reference), observed_(observed), motion_(motion), options_(options) {}
 
   void rows(int begin, int end, NormalEquations& out) const {
     for (int v = begin; v < end; ++v) {
-      for (int u = 0; u < width_; ++u) pixel(u, v, out);
+      for (int u = 0; u < observed_.width; ++u) pixel(u, v, out);
     }
   }
 
  private:
   void pixel(int u, int v, NormalEquations& out) const {
-    const size_t i = static_cast<size_t>(v) * width_ + u;
+    const Pinhole& camera = observed_.camera;
+    const size_t i = static_cast<size_t>(v) * observed_.width + u;
     const float z = reference_.depth[i];
     if (!reference_.mask[i] || !(z > 0.0f)) return;
-    const Point local{(u + 0.5f - camera_.cx) / camera_.fx * z, (v + 0.5f - camera_.cy) / camera_.fy * z, z};
-    const Point p{R_[0] * local.x + R_[1] * local.y + R_[2] * local.z + t_[0],
-                  R_[3] * local.x + R_[4] * local.y + R_[5] * local.z + t_[1],
-                  R_[6] * local.x + R_[7] * local.y + R_[8] * local.z + t_[2]};
+    const Point p = motion_.moved(back_projected(u + 0.5f, v + 0.5f, z, camera));
     if (!(p.z > 0.01f)) return;
-    const float image_u = camera_.fx * p.x / p.z + camera_.cx, image_v = camera_.fy * p.y / p.z + camera_.cy;
+    const float image_u = camera.fx * p.x / p.z + camera.cx, image_v = camera.fy * p.y / p.z + camera.cy;
     const float border = options_.border_px + 0.5f;
-    if (!(image_u >= border && image_v >= border && image_u < width_ - border && image_v < height_ - border)) return;
-    if (!depth_term(i, p, image_u, image_v, out)) return;
-    ++out.visible_count;
-    color_term(i, p, image_u, image_v, out);
-  }
-
-  // Point-to-plane distance to the nearest observed point. False where the two surfaces do not belong together.
-  bool depth_term(size_t i, const Point& p, float image_u, float image_v, NormalEquations& out) const {
-    const int u = static_cast<int>(image_u), v = static_cast<int>(image_v);
-    const float d = observed_.packed[(static_cast<size_t>(v) * width_ + u) * kPackedChannels + 9];
-    if (!(d > 0.0f)) return false;
-    const float sigma_z = options_.depth_sigma_base + options_.depth_sigma_quadratic * d * d;
-    const float* n = reference_.normals + 3 * i;
-    if (n[0] == 0.0f && n[1] == 0.0f && n[2] == 0.0f) {
-      return std::fabs(d - p.z) <= options_.depth_gate_sigmas * sigma_z;
+    if (!(image_u >= border && image_v >= border && image_u < observed_.width - border &&
+          image_v < observed_.height - border)) {
+      return;
     }
-    const Point normal{R_[0] * n[0] + R_[1] * n[1] + R_[2] * n[2], R_[3] * n[0] + R_[4] * n[1] + R_[5] * n[2],
-                       R_[6] * n[0] + R_[7] * n[1] + R_[8] * n[2]};
-    const Point q{(u + 0.5f - camera_.cx) / camera_.fx * d, (v + 0.5f - camera_.cy) / camera_.fy * d, d};
-    const float distance = normal.x * (q.x - p.x) + normal.y * (q.y - p.y) + normal.z * (q.z - p.z);
-    const float slant = std::fabs(normal.x * q.x + normal.y * q.y + normal.z * q.z) /
-                        std::sqrt(q.x * q.x + q.y * q.y + q.z * q.z);
-    const float sigma = sigma_z * std::max(slant, 0.2f);
-    const float r = distance / sigma;
-    if (std::fabs(r) > options_.depth_gate_sigmas) return false;
-    float J[6];
-    twist_row(p, Point{-normal.x, -normal.y, -normal.z}, J);
-    const float scale = options_.depth_weight * huber_weight(r) / (sigma * sigma);
-    add_row(out, J, scale, distance);
-    out.depth_cost += options_.depth_weight * huber_cost(r);
-    ++out.depth_count;
-    return true;
+    const size_t nearest = static_cast<size_t>(image_v) * observed_.width + static_cast<size_t>(image_u);
+    const float d = observed_.packed[nearest * kPackedChannels + 9];
+    if (!(d > 0.0f && std::fabs(d - p.z) <= options_.depth_gate_sigmas * depth_sigma(d, options_))) return;
+    add_difference(i, p, image_u, image_v, out);
   }
 
-  // Colour differences of the three channels share the projection's Jacobian A [2,6]: H += A^T (sum w g g^T) A.
-  void color_term(size_t i, const Point& p, float image_u, float image_v, NormalEquations& out) const {
+  // The three channels share the projection's Jacobian A [2,6]: H += A^T (sum w g g^T) A.
+  void add_difference(size_t i, const Point& p, float image_u, float image_v, NormalEquations& out) const {
     float sample[9];
     bilinear(image_u - 0.5f, image_v - 0.5f, sample);
     float uu = 0, uv = 0, vv = 0, ru = 0, rv = 0;
@@ -126,7 +165,7 @@ class BandSum {
     }
     ++out.color_count;
     const float scale = options_.color_weight / (options_.color_sigma * options_.color_sigma);
-    const float iz = 1.0f / p.z, au = camera_.fx * iz, av = camera_.fy * iz;
+    const float iz = 1.0f / p.z, au = observed_.camera.fx * iz, av = observed_.camera.fy * iz;
     float A[2][6];
     twist_row(p, Point{au, 0.0f, -au * p.x * iz}, A[0]);
     twist_row(p, Point{0.0f, av, -av * p.y * iz}, A[1]);
@@ -139,11 +178,11 @@ class BandSum {
   }
 
   void bilinear(float x, float y, float out[9]) const {
-    const int u = std::min(std::max(static_cast<int>(std::floor(x)), 0), width_ - 2);
-    const int v = std::min(std::max(static_cast<int>(std::floor(y)), 0), height_ - 2);
+    const int u = std::min(std::max(static_cast<int>(std::floor(x)), 0), observed_.width - 2);
+    const int v = std::min(std::max(static_cast<int>(std::floor(y)), 0), observed_.height - 2);
     const float a = x - u, b = y - v;
-    const float* p = observed_.packed + (static_cast<size_t>(v) * width_ + u) * kPackedChannels;
-    const float* q = p + static_cast<size_t>(width_) * kPackedChannels;
+    const float* p = observed_.packed + (static_cast<size_t>(v) * observed_.width + u) * kPackedChannels;
+    const float* q = p + static_cast<size_t>(observed_.width) * kPackedChannels;
     for (int c = 0; c < 9; ++c) {
       const float top = p[c] + a * (p[c + kPackedChannels] - p[c]);
       const float bottom = q[c] + a * (q[c + kPackedChannels] - q[c]);
@@ -153,10 +192,8 @@ class BandSum {
 
   ReferenceView reference_;
   ObservedView observed_;
-  int width_, height_;
-  Pinhole camera_;
+  Motion motion_;
   AlignmentOptions options_;
-  float R_[9], t_[3];
 };
 
 void add(NormalEquations& sum, const NormalEquations& part) {
@@ -166,20 +203,26 @@ void add(NormalEquations& sum, const NormalEquations& part) {
   sum.depth_cost += part.depth_cost;
   sum.color_count += part.color_count;
   sum.depth_count += part.depth_count;
-  sum.visible_count += part.visible_count;
 }
 
 }  // namespace
 
-NormalEquations normal_equations(const ReferenceView& reference, const ObservedView& observed, int width, int height,
-                                 const Pinhole& camera, const double R[9], const double t[3],
-                                 const AlignmentOptions& options, int threads) {
-  const BandSum sum(reference, observed, width, height, camera, R, t, options);
+NormalEquations normal_equations(const ReferenceView& reference, const ObservedView& observed,
+                                 const ReferencePoints& points, const DepthView& depth, const double R[9],
+                                 const double t[3], const AlignmentOptions& options, int threads) {
+  const Motion motion(R, t);
+  const ColorTerm color(reference, observed, motion, options);
+  const DepthTerm planes(points, depth, motion, options);
   std::vector<NormalEquations> bands(kBands, NormalEquations{});
   const int workers = std::min(std::max(threads, 1), kBands);
   auto work = [&](int worker) {
     for (int band = worker; band < kBands; band += workers) {
-      sum.rows(height * band / kBands, height * (band + 1) / kBands, bands[band]);
+      if (options.color_weight > 0) {
+        color.rows(observed.height * band / kBands, observed.height * (band + 1) / kBands, bands[band]);
+      }
+      if (options.depth_weight > 0) {
+        planes.band(points.count * band / kBands, points.count * (band + 1) / kBands, bands[band]);
+      }
     }
   };
   std::vector<std::thread> pool;
@@ -189,6 +232,32 @@ NormalEquations normal_equations(const ReferenceView& reference, const ObservedV
   NormalEquations total{};
   for (const NormalEquations& band : bands) add(total, band);
   return total;
+}
+
+int64_t visible_points(const float* points, const float* normals, int64_t count, const double R[9], const double t[3],
+                       const RenderedDepth& rendered, float tolerance, float* packed) {
+  const Motion motion(R, t);
+  const Pinhole& camera = rendered.camera;
+  int64_t kept = 0;
+  for (int64_t i = 0; i < count; ++i) {
+    const float* n = normals + 3 * i;
+    if (n[0] == 0.0f && n[1] == 0.0f && n[2] == 0.0f) continue;
+    const Point p = motion.moved({points[3 * i], points[3 * i + 1], points[3 * i + 2]});
+    if (!(p.z > 0.01f)) continue;
+    const float u = camera.fx * p.x / p.z + camera.cx, v = camera.fy * p.y / p.z + camera.cy;
+    if (!(u >= 0.0f && v >= 0.0f && u < rendered.width && v < rendered.height)) continue;
+    const float d = rendered.depth[static_cast<size_t>(v) * rendered.width + static_cast<size_t>(u)];
+    if (!(d > 0.0f && std::fabs(d - p.z) <= tolerance * p.z)) continue;
+    const Point q = motion.rotated({n[0], n[1], n[2]});
+    float* row = packed + 6 * kept++;
+    row[0] = p.x;
+    row[1] = p.y;
+    row[2] = p.z;
+    row[3] = q.x;
+    row[4] = q.y;
+    row[5] = q.z;
+  }
+  return kept;
 }
 
 void normals_from_depth(const float* depth, int width, int height, const Pinhole& camera, float max_relative_step,

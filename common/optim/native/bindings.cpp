@@ -40,27 +40,40 @@ vtslam::Pinhole pinhole(const std::tuple<float, float, float, float>& k) {
 }
 
 using Intrinsics = std::tuple<float, float, float, float>;
-using System = std::tuple<Out<double, 2>, Out<double, 1>, double, double, int64_t, int64_t, int64_t>;
+using System = std::tuple<Out<double, 2>, Out<double, 1>, double, double, int64_t, int64_t>;
 using Loss = std::tuple<double, double, int64_t, Out<float, 3>, Out<float, 2>>;
 
-System normal_equations(In<float, 3> rgb, In<float, 2> depth, In<float, 3> normals, In<uint8_t, 2> mask,
-                        In<float, 3> packed, Intrinsics camera, In<double, 2> T_observed_reference,
-                        const vtslam::AlignmentOptions& options, int threads) {
+struct Transform {
+  explicit Transform(const In<double, 2>& T) {
+    require(T, {4, 4}, "transform");
+    const double* m = T.data();
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) R[3 * i + j] = m[4 * i + j];
+      t[i] = m[4 * i + 3];
+    }
+  }
+  double R[9], t[3];
+};
+
+System normal_equations(In<float, 3> rgb, In<float, 2> depth, In<uint8_t, 2> mask, In<float, 3> packed,
+                        Intrinsics camera, In<float, 2> points, In<float, 2> frame_depth, Intrinsics frame_camera,
+                        In<double, 2> T_observed_reference, const vtslam::AlignmentOptions& options, int threads) {
   const size_t h = depth.shape(0), w = depth.shape(1);
   require(rgb, {h, w, 3}, "rgb");
-  require(normals, {h, w, 3}, "normals");
   require(mask, {h, w}, "mask");
   require(packed, {h, w, 10}, "packed");
-  require(T_observed_reference, {4, 4}, "T_observed_reference");
+  require(points, {points.shape(0), 6}, "points");
   if (h < 2 || w < 2) throw nb::value_error("images need at least 2x2 pixels");
-  const double* T = T_observed_reference.data();
-  const double R[9] = {T[0], T[1], T[2], T[4], T[5], T[6], T[8], T[9], T[10]};
-  const double t[3] = {T[3], T[7], T[11]};
+  const Transform T(T_observed_reference);
+  const vtslam::ReferenceView reference{rgb.data(), depth.data(), mask.data()};
+  const vtslam::ObservedView observed{packed.data(), static_cast<int>(w), static_cast<int>(h), pinhole(camera)};
+  const vtslam::ReferencePoints surface{points.data(), static_cast<int64_t>(points.shape(0))};
+  const vtslam::DepthView view{frame_depth.data(), static_cast<int>(frame_depth.shape(1)),
+                               static_cast<int>(frame_depth.shape(0)), pinhole(frame_camera)};
   vtslam::NormalEquations out;
   {
     nb::gil_scoped_release release;
-    out = vtslam::normal_equations({rgb.data(), depth.data(), normals.data(), mask.data()}, {packed.data()},
-                                   static_cast<int>(w), static_cast<int>(h), pinhole(camera), R, t, options, threads);
+    out = vtslam::normal_equations(reference, observed, surface, view, T.R, T.t, options, threads);
   }
   nb::capsule h_owner, g_owner;
   double* H = owned<double>(36, h_owner);
@@ -71,7 +84,26 @@ System normal_equations(In<float, 3> rgb, In<float, 2> depth, In<float, 3> norma
     for (int j = i; j < 6; ++j) H[6 * i + j] = H[6 * j + i] = out.H[k++];
   }
   return System(Out<double, 2>(H, {6, 6}, h_owner), Out<double, 1>(g, {6}, g_owner), out.color_cost, out.depth_cost,
-                out.color_count, out.depth_count, out.visible_count);
+                out.color_count, out.depth_count);
+}
+
+Out<float, 2> visible_points(In<float, 2> points, In<float, 2> normals, In<double, 2> T_camera_map,
+                             In<float, 2> depth, Intrinsics camera, float tolerance) {
+  const size_t count = points.shape(0);
+  require(points, {count, 3}, "points");
+  require(normals, {count, 3}, "normals");
+  const Transform T(T_camera_map);
+  const vtslam::RenderedDepth view{depth.data(), static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)),
+                                   pinhole(camera)};
+  nb::capsule owner;
+  float* packed = owned<float>(6 * count, owner);
+  int64_t kept;
+  {
+    nb::gil_scoped_release release;
+    kept = vtslam::visible_points(points.data(), normals.data(), static_cast<int64_t>(count), T.R, T.t, view,
+                                  tolerance, packed);
+  }
+  return Out<float, 2>(packed, {static_cast<size_t>(kept), 6}, owner);
 }
 
 Out<float, 3> normals_from_depth(In<float, 2> depth, Intrinsics camera, float max_relative_step) {
@@ -124,9 +156,11 @@ NB_MODULE(_align, m) {
           },
           nb::kw_only(), "color_sigma"_a, "color_weight"_a, "depth_sigma_base"_a, "depth_sigma_quadratic"_a,
           "depth_weight"_a, "depth_gate_sigmas"_a, "border_px"_a);
-  m.def("normal_equations", &normal_equations, "rgb"_a, "depth"_a, "normals"_a, "mask"_a, "packed"_a, "camera"_a,
-        "T_observed_reference"_a, "options"_a, "threads"_a,
-        "H [6,6], g [6], colour cost, depth cost, colour count, depth count, visible count.");
+  m.def("normal_equations", &normal_equations, "rgb"_a, "depth"_a, "mask"_a, "packed"_a, "camera"_a, "points"_a,
+        "frame_depth"_a, "frame_camera"_a, "T_observed_reference"_a, "options"_a, "threads"_a,
+        "H [6,6], g [6], colour cost, depth cost, colour count, depth count.");
+  m.def("visible_points", &visible_points, "points"_a, "normals"_a, "T_camera_map"_a, "depth"_a, "camera"_a,
+        "tolerance"_a, "Points [M,6] (position, normal; camera frame) that a rendered depth image shows.");
   m.def("normals_from_depth", &normals_from_depth, "depth"_a, "camera"_a, "max_relative_step"_a,
         "Unit normals [H,W,3] of a depth image (m); zero where unknown.");
   m.def("tracking_loss", &tracking_loss, "rgb"_a, "depth"_a, "alpha"_a, "target_rgb"_a, "target_depth"_a, "mask"_a,
