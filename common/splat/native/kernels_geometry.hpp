@@ -12,8 +12,8 @@ constexpr int kGroup = 16;  // Gaussians handled together
 
 struct Group {
   alignas(64) float sigma[kGroup], opacity_complement[kGroup], log2_opacity[kGroup];
-  alignas(64) double x[kGroup], y[kGroup], z[kGroup];
-  alignas(64) double u[kGroup], v[kGroup];
+  alignas(64) float x[kGroup], y[kGroup], z[kGroup];
+  alignas(64) float column[kGroup], column_fraction[kGroup], row[kGroup], row_fraction[kGroup];
   alignas(64) float conic_xx[kGroup], conic_xy[kGroup], conic_yy[kGroup];
   alignas(64) int left[kGroup], right[kGroup], top[kGroup], bottom[kGroup];
 };
@@ -78,17 +78,21 @@ VTSLAM_INLINE void project_group(const View& view, const Settings& settings, con
     const bool visible =
         in_front && reach2 >= 0.0 && __builtin_fabs(u) < kMaxImageCoordinate && __builtin_fabs(v) < kMaxImageCoordinate;
     // A little more than where alpha_min is met, for rounding; the pixel loops test alpha itself.
-    const double reach_u = __builtin_sqrt(visible ? reach2 * a : 0.0) * 1.00001 + 1e-3;
-    const double reach_v = __builtin_sqrt(visible ? reach2 * c : 0.0) * 1.00001 + 1e-3;
+    const double reach_u = double(__builtin_sqrtf(visible ? float(reach2 * a) : 0.0f)) * 1.00001 + 1e-3;
+    const double reach_v = double(__builtin_sqrtf(visible ? float(reach2 * c) : 0.0f)) * 1.00001 + 1e-3;
     const double left = clamped(u - reach_u - 0.5, -1.0, view.width);
     const double right = clamped(u + reach_u - 0.5, -1.0, view.width - 1.0);
     const double top = clamped(v - reach_v - 0.5, -1.0, view.height);
     const double bottom = clamped(v + reach_v - 0.5, -1.0, view.height - 1.0);
-    group.x[l] = x;
-    group.y[l] = y;
-    group.z[l] = z;
-    group.u[l] = visible ? u : 0.0;
-    group.v[l] = visible ? v : 0.0;
+    group.x[l] = float(x);
+    group.y[l] = float(y);
+    group.z[l] = float(z);
+    const float column = float(floor_of(clamped(u, -65000.0, 65000.0)));
+    const float row = float(floor_of(clamped(v, -65000.0, 65000.0)));
+    group.column[l] = column;
+    group.row[l] = row;
+    group.column_fraction[l] = float(u - double(column));
+    group.row_fraction[l] = float(v - double(row));
     group.conic_xx[l] = float(-0.5 * c * scale);
     group.conic_xy[l] = float(b * scale);
     group.conic_yy[l] = float(-0.5 * a * scale);
@@ -101,10 +105,10 @@ VTSLAM_INLINE void project_group(const View& view, const Settings& settings, con
 }
 
 VTSLAM_INLINE void write_record(const Group& group, int l, const float* color, SplatRecord& record) {
-  record.column = float(floor_of(clamped(group.u[l], -65000.0, 65000.0)));
-  record.row = float(floor_of(clamped(group.v[l], -65000.0, 65000.0)));
-  record.column_fraction = float(group.u[l] - double(record.column));
-  record.row_fraction = float(group.v[l] - double(record.row));
+  record.column = group.column[l];
+  record.column_fraction = group.column_fraction[l];
+  record.row = group.row[l];
+  record.row_fraction = group.row_fraction[l];
   record.conic_xx = group.conic_xx[l];
   record.conic_xy = group.conic_xy[l];
   record.conic_yy = group.conic_yy[l];
@@ -112,11 +116,19 @@ VTSLAM_INLINE void write_record(const Group& group, int l, const float* color, S
   record.red = color[0];
   record.green = color[1];
   record.blue = color[2];
-  record.depth = float(group.z[l]);
+  record.depth = group.z[l];
   record.left = int16_t(group.left[l]);
   record.right = int16_t(group.right[l]);
   record.top = int16_t(group.top[l]);
   record.bottom = int16_t(group.bottom[l]);
+}
+
+VTSLAM_INLINE void keep_geometry(const Group& group, uint32_t first, int count, const Geometry& geometry) {
+  for (int l = 0; l < count; ++l) geometry.x[first + l] = group.x[l];
+  for (int l = 0; l < count; ++l) geometry.y[first + l] = group.y[l];
+  for (int l = 0; l < count; ++l) geometry.z[first + l] = group.z[l];
+  for (int l = 0; l < count; ++l) geometry.sigma[first + l] = group.sigma[l];
+  for (int l = 0; l < count; ++l) geometry.opacity_complement[first + l] = group.opacity_complement[l];
 }
 
 bool project(const ProjectArgs& args, uint32_t begin, uint32_t end, uint32_t* tile_counts, uint64_t* pairs) {
@@ -130,19 +142,20 @@ bool project(const ProjectArgs& args, uint32_t begin, uint32_t end, uint32_t* ti
   uint64_t slots = 0;
   for (uint32_t first = begin; first < end; first += kGroup) {
     const int count = end - first < kGroup ? int(end - first) : kGroup;
-    float means[3 * kGroup] = {}, log_radii[kGroup] = {}, logits[kGroup] = {};
-    for (int i = 0; i < 3 * count; ++i) means[i] = in.means[3 * size_t(first) + i];
-    for (int i = 0; i < count; ++i) log_radii[i] = in.log_radii[first + i];
-    for (int i = 0; i < count; ++i) logits[i] = in.opacity_logits[first + i];
-    activate(log_radii, logits, group);
-    project_group(args.view, args.settings, means, group);
+    if (count == kGroup) {
+      activate(in.log_radii + first, in.opacity_logits + first, group);
+      project_group(args.view, args.settings, in.means + 3 * size_t(first), group);
+    } else {
+      float means[3 * kGroup] = {}, log_radii[kGroup] = {}, logits[kGroup] = {};
+      for (int i = 0; i < 3 * count; ++i) means[i] = in.means[3 * size_t(first) + i];
+      for (int i = 0; i < count; ++i) log_radii[i] = in.log_radii[first + i];
+      for (int i = 0; i < count; ++i) logits[i] = in.opacity_logits[first + i];
+      activate(log_radii, logits, group);
+      project_group(args.view, args.settings, means, group);
+    }
+    keep_geometry(group, first, count, args.geometry);
     for (int l = 0; l < count; ++l) {
       const uint32_t i = first + l;
-      args.geometry.x[i] = float(group.x[l]);
-      args.geometry.y[i] = float(group.y[l]);
-      args.geometry.z[i] = float(group.z[l]);
-      args.geometry.sigma[i] = group.sigma[l];
-      args.geometry.opacity_complement[i] = group.opacity_complement[l];
       args.slot_starts[i] = uint32_t(slots);
       TileRect rect{1, 0, 1, 0};
       if (group.left[l] <= group.right[l] && group.top[l] <= group.bottom[l]) {
