@@ -1,4 +1,4 @@
-"""What a run is judged by: the keys of ``metrics.json`` and ``report.json``, as in design section 12.
+"""What a run is judged by: the keys of ``metrics.json`` and ``report.json`` (docs/metrics.md).
 
 Errors of poses are in ``metrics_trajectory``, of images in ``metrics_images``; here is which frames count, and how
 they are put together. Rendering is the caller's. A figure that has nothing to look at is None.
@@ -21,7 +21,7 @@ SEAM_FRAMES = 10  # on each side of a seam; fewer where a section is shorter
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameQuality:
-    """Quality of one frame rendered from its own section at its estimated pose; keys as in design section 12."""
+    """Quality of one frame rendered from its own section at its estimated pose; keys as in docs/metrics.md."""
 
     frame: int
     section: int
@@ -112,7 +112,7 @@ def summarise(
     trajectory: TrajectoryErrors | None,
     costs: RunCosts,
 ) -> dict[str, object]:
-    """The content of ``metrics.json``: plain values, exactly the keys of design section 12.
+    """The content of ``metrics.json``: plain values, exactly the keys of docs/metrics.md.
 
     Args:
         evaluated: Quality of the `evaluated_frames`; they make ``per_frame``, with ``position_error_m``.

@@ -1,4 +1,4 @@
-"""Image quality of a rendering against the observed frame (design section 12).
+"""Image quality of a rendering against the observed frame (docs/metrics.md).
 
 Images are float [H,W,3] with data range 1; renderings are taken as they are, not clamped to 0..1. All sums are
 float64. PSNR is the mean of the three channels' PSNR, at most 100 dB. Masks are bool [H,W]; figures that have no pixel

@@ -1,4 +1,4 @@
-"""Errors of an estimated trajectory: ATE after rigid alignment, RPE over one frame (design section 12)."""
+"""Errors of an estimated trajectory: ATE after rigid alignment, RPE over one frame (docs/metrics.md)."""
 
 from dataclasses import dataclass
 

@@ -20,7 +20,7 @@ FloatArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RasterSettings:
-    """Constants of the image model (module text); defaults as in design section 5."""
+    """Constants of the image model (module text)."""
 
     low_pass_px2: float = 0.001
     near_m: float = 0.2

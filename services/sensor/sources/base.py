@@ -25,7 +25,7 @@ class Source(Protocol):
 
     @property
     def family(self) -> str:
-        """The settings family that fits it (design section 6)."""
+        """The settings family that fits it (`vtslam.common.preset_loading.FAMILIES`)."""
         ...
 
     @property
