@@ -35,7 +35,7 @@ class SourceSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplatSettings:
-    """The rasteriser (design section 5).
+    """The rasteriser.
 
     Attributes:
         engine: Which one.

@@ -1,4 +1,4 @@
-"""Which earlier sections see what a head frame sees (paper, section 3.3; design section 6)."""
+"""Which earlier sections see what a head frame sees (paper, section 3.3; docs/method.md, 2.4)."""
 
 from dataclasses import dataclass
 
@@ -113,7 +113,7 @@ def overlap_shares(
 def sections_to_pretrack(
     shares: npt.NDArray[np.float64], views: list[CandidateView], *, head_section_id: int, settings: OverlapSettings
 ) -> list[int]:
-    """The earliest sections that see enough of a head frame (method: gamma, decayed while too few pass).
+    """The earliest sections that see enough of a head frame (gamma decays while too few pass).
 
     Args:
         shares: float64 [V], share of the head's points each view saw.

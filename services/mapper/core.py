@@ -128,7 +128,7 @@ class Mapper:
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
             for index in chosen:
-                # The head alone is shared with the neighbours (method 7.3).
+                # The head alone is shared with the neighbours (docs/method.md, 3.3).
                 optimiser.step(views[index], with_neighbours=index == 0)
         return optimiser.finished()
 
@@ -156,7 +156,7 @@ class Mapper:
     def _uncovered(
         self, section: Section, frame: Frame, T_section_frame: npt.NDArray[np.float64]
     ) -> npt.NDArray[np.bool_]:
-        """Pixels where the section shows nothing, or something far behind what was measured (method 7.1)."""
+        """Pixels where the section shows nothing, or something far behind what was measured (docs/method.md, 3.1)."""
         if section.gaussians.count == 0:
             return frame.depth > 0
         rendering: Rendering = self.engine.render(section.splats, frame.camera, se3.inverse(T_section_frame))

@@ -13,7 +13,7 @@ from vtslam.common.settings import MapperSettings
 from vtslam.common.splat.engine import Engine, Gradients, Splats
 from vtslam.services.mapper.state import Moments, TrainingView
 
-_EPSILON = 1e-15  # of Adam in mapping (method 5)
+_EPSILON = 1e-15  # of Adam in mapping, as in the released program
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -178,7 +178,7 @@ class Tracker:
         )
 
     def _far_off(self, estimate: PoseEstimate, state: TrackerState) -> bool:
-        """The 50x rule: loss at the guess far above the median of past losses (method 6.9)."""
+        """The 50x rule: loss at the guess far above the median of past losses (docs/method.md, 2.5)."""
         if len(state.losses) < _MIN_LOSSES:
             return False
         usual = np.median(np.array(state.losses), axis=0)

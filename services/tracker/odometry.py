@@ -1,4 +1,4 @@
-"""RGB-D odometry between two frames, the rescue when the constant-velocity guess is far off (method 6.9)."""
+"""RGB-D odometry between two frames, the rescue when the constant-velocity guess is far off (docs/method.md, 2.5)."""
 
 import cv2
 import numpy as np

@@ -67,7 +67,7 @@ def make_optimiser(
 
 
 class _Adam:
-    """First-order descent with the minimum of the loss kept (method 5; the pose kept is the one evaluated)."""
+    """First-order descent with the minimum of the loss kept (the pose kept is the one evaluated)."""
 
     def __init__(
         self, frame: Frame, engine: Engine, settings: AdamSettings, *, in_first_section: bool, prior: PosePrior | None
@@ -134,7 +134,7 @@ def _adam_covariance(loss: TrackingLoss, camera: Camera) -> npt.NDArray[np.float
 
 
 def _adaptive_silhouette(rendering: Rendering, target: Target) -> float:
-    """The threshold with the smallest mean squared colour error inside it (method 6.4)."""
+    """The threshold with the smallest mean squared colour error inside it (docs/method.md, 2.3)."""
     squared = np.square(rendering.rgb - target.rgb).mean(axis=2)
     errors = []
     for threshold in _ADAPTIVE_SILHOUETTES:

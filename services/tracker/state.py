@@ -10,7 +10,7 @@ from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 
 _HISTORY_FRAMES = 200  # losses remembered: enough for a stable median, bounded on endless streams
-_FAR_SAMPLES = 30  # largest mean depths kept for the far filter (method)
+_FAR_SAMPLES = 30  # largest mean depths kept for the far filter (docs/method.md, 2.2)
 
 
 class TrackingState(Enum):

@@ -73,7 +73,7 @@ def test_seam_of_two_sections() -> None:
     assert metrics.seam_of(3, next_db=[None], last_db=[30.0]) is None
 
 
-def test_summary_holds_the_keys_of_the_design() -> None:
+def test_summary_holds_the_documented_keys() -> None:
     summary = metrics.summarise(evaluated=[], heldout=[], seams=[], trajectory=None, costs=COSTS)
     assert set(summary) == KEYS
     empty = {key for key, value in summary.items() if value is None}
