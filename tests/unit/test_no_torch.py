@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from helpers.processes import source_environment
+from helpers.recordings import write_replica
 
 
 def run_python(code: str, *words: str) -> str:
@@ -22,13 +23,13 @@ def test_import_of_the_package_imports_nothing_else() -> None:
 
 def test_every_public_name_is_there_and_the_cpu_path_never_imports_torch(tmp_path: Path) -> None:
     code = (
-        "import sys, vtslam\n"
+        "import sys, vtslam, vtslam.services.report, vtslam.services.sensor.sources.sim_room\n"
         "assert all(getattr(vtslam, name) is not None for name in vtslam.__all__)\n"
         "assert set(vtslam.__all__) <= set(dir(vtslam))\n"
-        "small = ['source.size=48x36', 'source.frames=0:3', 'section.length=2']\n"
-        "vtslam.run('sim:room', sys.argv[1], assignments=small)\n"
-        "vtslam.evaluate(sys.argv[1])\n"
+        "vtslam.run(sys.argv[1], sys.argv[2], assignments=['section.length=2'])\n"
+        "vtslam.evaluate(sys.argv[2])\n"
         "print('torch' in sys.modules)"
     )
 
-    assert run_python(code, str(tmp_path / "run")).strip() == "False"
+    recording = write_replica(tmp_path / "recording", num_frames=3)
+    assert run_python(code, recording.uri, str(tmp_path / "run")).strip() == "False"
