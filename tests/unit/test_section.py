@@ -34,6 +34,7 @@ def small_section(section_id: int = 0, T_world_section: npt.NDArray[np.float64] 
         frames=tuple(frames),
         gaussians=gaussians,
         means_m=np.zeros((0, 3), np.float32),
+        normals=np.zeros((0, 3), np.float32),
     ).retied()
 
 
@@ -48,6 +49,33 @@ def test_positions_are_recomputed_from_the_frame_table() -> None:
     after = replace(section, frames=(section.frames[0], moved)).retied()
     np.testing.assert_array_equal(after.means_m[:half], section.means_m[:half])
     assert np.abs(after.means_m[half:] - section.means_m[half:]).max() > 0.01
+
+
+def test_growing_gives_the_same_as_tying_anew() -> None:
+    section = small_section()
+    frame = SmoothRoom().frame(START @ STEP @ STEP, CAMERA, frame_id=2)
+    new = tied_to_frame(frame, frame.depth > 0, frame_index=2, depth_factor=1.01, opacity=0.9)
+    row = SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP)
+    grown = replace(section, frames=(*section.frames, row)).grown(new)
+    own = section.gaussians.count
+    assert grown.gaussians.count == own + new.count
+    assert grown.means_m[:own].tobytes() == section.means_m.tobytes()
+    again = grown.retied()
+    assert again.means_m.tobytes() == grown.means_m.tobytes()
+    assert again.normals.tobytes() == grown.normals.tobytes()
+
+
+def test_normals_are_unit_and_face_along_the_surface() -> None:
+    section = small_section()
+    lengths = np.linalg.norm(section.normals, axis=1)
+    inner = lengths > 0
+    assert inner.mean() > 0.7
+    np.testing.assert_allclose(lengths[inner], 1.0, atol=1e-5)
+    # The ellipsoid's own normals, in section coordinates.
+    world = section.means_m / section.depth_factor @ START[:3, :3].T + START[:3, 3]
+    true = (world / np.square(SmoothRoom().radii_m)) @ START[:3, :3]
+    cosine = np.abs((true * section.normals).sum(axis=1)) / np.linalg.norm(true, axis=1)
+    assert cosine[inner & (section.gaussians.frame_index == 0)].min() > 0.99
 
 
 def test_the_anchor_moves_the_world_pose_of_every_frame_but_no_position() -> None:
