@@ -29,5 +29,5 @@ class Scene:
 
 def fractal_noise(height: int, width: int, cells_y: int, cells_x: int, octaves: int, gain: float, seed: int, num_threads: int) -> Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')]:
     """
-    Seamless gradient noise float32 [height,width]: octave k has (cells_y, cells_x) * 2^k cells and a standard deviation of about gain^k; octaves finer than 2 texels per cell are left out.
+    Seamless gradient noise float32 [height,width]: octave k has (cells_y, cells_x) * 2^k cells and a standard deviation of about 0.83 gain^k; octaves finer than 2 texels per cell are left out.
     """

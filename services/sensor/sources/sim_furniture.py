@@ -6,6 +6,20 @@ from vtslam.services.sensor.sources.sim_scene import Colour, Finish, SceneBuilde
 
 Rng = np.random.Generator
 
+_COVERS: tuple[Colour, ...] = (  # red, navy, bottle green, ochre, cream, brown, teal, black, orange, grey blue, plum
+    (0.95, 0.3, 0.26),
+    (0.26, 0.34, 0.66),
+    (0.28, 0.54, 0.34),
+    (0.98, 0.76, 0.36),
+    (1.15, 1.08, 0.92),
+    (0.62, 0.42, 0.28),
+    (0.3, 0.62, 0.62),
+    (0.32, 0.32, 0.34),
+    (1.1, 0.58, 0.26),
+    (0.62, 0.74, 0.9),
+    (0.6, 0.3, 0.45),
+)
+
 
 def table(scene: SceneBuilder, at: Vector, size: Vector, top: Finish, legs: Finish) -> None:
     """A table whose feet stand around ``at`` (floor centre), of full size (x, y, height)."""
@@ -59,8 +73,8 @@ def book_row(scene: SceneBuilder, start: Vector, length: float, room: float, rng
 
 
 def book_colour(rng: Rng) -> Colour:
-    """A muted or strong cover colour."""
-    r, g, b = rng.uniform(0.35, 1.05, 3).tolist()
+    """A cover colour near one of those in use."""
+    r, g, b = (np.array(_COVERS[int(rng.integers(len(_COVERS)))]) * rng.uniform(0.75, 1.2, 3)).tolist()
     return r, g, b
 
 

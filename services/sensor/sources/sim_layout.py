@@ -124,7 +124,7 @@ def _side_walls(scene: SceneBuilder, brush: Brush) -> None:
     furniture.framed(scene, (wide, 1.95, 1.62), "-x", (1.1, 0.72), "landscape", walnut)
     scene.cone((wide - 0.02, 3.1, 1.75), (0.17, 0.17), 0.04, _clock(), turned(pitch_deg=-90.0))
     # The window: a bright view behind bars, curtains at both sides, a heater below.
-    scene.box((0.015, 2.0, 1.55), (0.03, 1.3, 1.2), Finish(material="view", stretch=(1.3, 1.2), glow=0.4))
+    scene.box((0.015, 2.0, 1.55), (0.03, 1.3, 1.2), Finish(material="view", stretch=(1.3, 1.2), glow=0.3))
     for y in (1.33, 2.0, 2.67):
         scene.box((0.03, y, 1.55), (0.06, 0.05, 1.3), oak)
     for z in (0.93, 1.55, 2.17):

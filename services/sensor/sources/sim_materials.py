@@ -27,24 +27,26 @@ class Brush:
         return np.random.Generator(np.random.Philox(key=[self._seed, zlib.crc32(name.encode())]))
 
     def noise(self, size: tuple[int, int], cells: tuple[int, int], octaves: int, gain: float, name: str) -> Plane:
-        """Seamless fractal noise: ``cells`` (down, across) in the first octave, deviation about ``gain**k`` each."""
+        """Seamless fractal noise: ``cells`` (down, across) in octave 0, deviation about ``0.83 * gain**k``."""
         key = (self._seed * 0x9E3779B1 + zlib.crc32(name.encode())) & 0xFFFFFFFF
         return fractal_noise(*size, *cells, octaves, gain, key, self._num_threads)
 
     def grain(self, size: tuple[int, int], name: str) -> Plane:
-        """Equal strength in all octaves from 32 down to 2 texels: detail at every distance of view."""
+        """Noise in waves of 32 to 4 texels, the shorter the stronger; deviation about 1.3."""
         if size not in self._grain:
-            self._grain[size] = self.noise(size, (size[0] // 16, size[1] // 16), 4, 1.35, f"grain {size}") * np.float32(
-                0.45
-            )
+            waves = self.noise(size, (size[0] // 16, size[1] // 16), 4, 1.35, f"grain {size}")
+            self._grain[size] = np.float32(0.45) * waves
         shift = self.rng(name).integers(0, 1 << 16, 2)
         return np.roll(self._grain[size], (int(shift[0]), int(shift[1])), (0, 1))
 
 
 def blend(a: Colour, b: Colour, weight: Plane) -> Image:
     """Colour ``a`` where the weight [h,w] is 0, ``b`` where it is 1: float32 [h,w,3]."""
-    start, way = np.array(a, np.float32), np.array(b, np.float32) - np.array(a, np.float32)
-    return np.asarray(start + weight[..., None] * way, np.float32)
+    out = np.empty((*weight.shape, 3), np.float32)
+    for channel in range(3):  # in passes over planes: several times faster than over triples
+        np.multiply(weight, np.float32(b[channel] - a[channel]), out=out[..., channel])
+        out[..., channel] += np.float32(a[channel])
+    return out
 
 
 def material(image: Image, *, width_m: float | None = None, height_m: float | None = None) -> Material:
@@ -70,9 +72,9 @@ def _wave(x: Plane, period: float) -> Plane:
 def wood(brush: Brush, name: str, dark: Colour, light: Colour, *, contrast: float = 1.0) -> Material:
     """Straight-grained wood, grain along u."""
     size = (512, 512)
-    fibres = brush.noise(size, (64, 6), 3, 0.9, name + " fibres")
+    fibres = brush.noise(size, (64, 8), 3, 1.15, name + " fibres")
     rings = _wave(_grid(size)[0] + 9.0 * brush.noise(size, (4, 2), 3, 0.5, name + " rings"), 512.0 / 14.0)
-    weight = 0.5 + contrast * (0.1 * fibres + 0.3 * (rings - 0.5) + 0.18 * brush.grain(size, name))
+    weight = 0.5 + contrast * (0.15 * fibres + 0.3 * (rings - 0.5) + 0.07 * brush.grain(size, name))
     return material(blend(dark, light, weight))
 
 
@@ -86,9 +88,9 @@ def planks(brush: Brush) -> Material:
     along = np.mod(u + start[row].astype(np.float32), np.float32(size[1]))
     board = (along > 560.0).astype(np.intp)
     shade = tone[row, board].astype(np.float32)
-    fibres = brush.noise(size, (128, 8), 3, 0.9, "plank fibres")
+    fibres = brush.noise(size, (128, 12), 3, 1.1, "plank fibres")
     rings = _wave(v + 12.0 * brush.noise(size, (8, 3), 3, 0.5, "plank rings"), 32.0)
-    weight = 0.5 + shade + 0.085 * fibres + 0.2 * (rings - 0.5) + 0.12 * brush.grain(size, "planks")
+    weight = 0.5 + shade + 0.1 * fibres + 0.2 * (rings - 0.5) + 0.07 * brush.grain(size, "planks")
     image = blend((0.36, 0.21, 0.11), (0.80, 0.57, 0.34), weight)
     across = np.mod(v, size[0] / rows)
     seam = (np.minimum(across, size[0] / rows - across) < 1.5) | (np.abs(along - 560.0) < 1.5) | (along < 1.5)
@@ -118,7 +120,7 @@ def wallpaper(brush: Brush, name: str, ground: Colour, figure: Colour, leaf: Col
     """Wallpaper with ogee medallions and leaves on a grained ground, repeat 25.6 x 25.6 cm."""
     size, period = (512, 512), 128.0
     v, u = _grid(size)
-    image = blend(ground, figure, 0.18 + 0.26 * brush.grain(size, name) + 0.05 * _wave(u, 16.0))
+    image = blend(ground, figure, 0.19 + 0.28 * brush.grain(size, name) + 0.05 * _wave(u, 16.0))
     for half in (0.0, 0.5):
         y = np.mod(v / period + half, 1.0) - 0.5
         x = np.mod(u / period + half, 1.0) - 0.5

@@ -144,5 +144,5 @@ NB_MODULE(_raycast, m) {
   m.def("fractal_noise", &fractal_noise, "height"_a, "width"_a, "cells_y"_a, "cells_x"_a, "octaves"_a, "gain"_a,
         "seed"_a, "num_threads"_a,
         "Seamless gradient noise float32 [height,width]: octave k has (cells_y, cells_x) * 2^k cells and a standard "
-        "deviation of about gain^k; octaves finer than 2 texels per cell are left out.");
+        "deviation of about 0.83 gain^k; octaves finer than 2 texels per cell are left out.");
 }

@@ -19,7 +19,7 @@ struct Gradient {
   float x, y;
 };
 
-constexpr float kOctaveGain = 3.9f;  // brings one octave of unit-gradient noise to a standard deviation of about 1
+constexpr float kOctaveGain = 3.9f;  // brings one octave of unit-gradient noise to a range of about -2 to 2
 
 Gradient gradient(std::uint32_t hash) {
   // 16 unit vectors, as exact decimals: no trigonometry, no difference between machines.

@@ -13,7 +13,7 @@ struct NoiseSettings {
   std::uint32_t seed;
 };
 
-// Writes height x width floats, row-major, mean about 0; each octave has a standard deviation of about gain^k.
+// Writes height x width floats, row-major, mean about 0; octave k has a standard deviation of about 0.83 gain^k.
 // The output tiles without a seam in both directions.
 void fractal_noise(const NoiseSettings& settings, int num_threads, float* out);
 
