@@ -27,7 +27,7 @@ class SimRoom:
     """A walk through a textured, furnished room of 5 x 4 x 2.6 m that ends where it began; see :class:`Source`.
 
     Every pixel has the exact depth of the ray through its centre, rounded to 0.2 mm; colour is the same from every
-    view but for sampling. Frames are the same bytes in whatever order they are read, on every machine.
+    view but for sampling. Frames are the same bytes in whatever order and by however many threads they are made.
 
     Args:
         frames: Length of the closed path, 2 to 100000.

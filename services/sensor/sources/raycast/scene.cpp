@@ -17,13 +17,16 @@ double away_from_zero(double x) { return std::abs(x) < 1e-12 ? 1e-12 : x; }
 Intersection box_hit(const Primitive& p, Vec3 o, Vec3 d, double near) {
   double enter = -kInfinity, leave = kInfinity;
   int enter_axis = 0, leave_axis = 0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const double inverse = 1.0 / away_from_zero(d[axis]);
-    const double a = (-p.size[axis] - o[axis]) * inverse, b = (p.size[axis] - o[axis]) * inverse;
+  const auto cut = [&](int axis, double origin, double direction, double half) {
+    const double inverse = 1.0 / away_from_zero(direction);
+    const double a = (-half - origin) * inverse, b = (half - origin) * inverse;
     const double first = std::min(a, b), last = std::max(a, b);
     if (first > enter) enter = first, enter_axis = axis;
     if (last < leave) leave = last, leave_axis = axis;
-  }
+  };
+  cut(0, o.x, d.x, p.size.x);
+  cut(1, o.y, d.y, p.size.y);
+  cut(2, o.z, d.z, p.size.z);
   if (enter > leave) return {};
   if (p.kind == Kind::kRoom) {
     return leave > near ? Intersection{leave, 2 * leave_axis + (d[leave_axis] > 0.0 ? 0 : 1)} : Intersection{};
