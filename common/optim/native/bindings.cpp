@@ -87,8 +87,8 @@ System normal_equations(In<float, 3> rgb, In<float, 2> depth, In<uint8_t, 2> mas
                 out.color_count, out.depth_count);
 }
 
-Out<float, 2> visible_points(In<float, 2> points, In<float, 2> normals, In<double, 2> T_camera_map,
-                             In<float, 2> depth, Intrinsics camera, float tolerance) {
+Out<float, 2> visible_points(In<float, 2> points, In<float, 2> normals, In<double, 2> T_camera_map, In<float, 2> depth,
+                             Intrinsics camera, float tolerance) {
   const size_t count = points.shape(0);
   require(points, {count, 3}, "points");
   require(normals, {count, 3}, "normals");
@@ -100,8 +100,8 @@ Out<float, 2> visible_points(In<float, 2> points, In<float, 2> normals, In<doubl
   int64_t kept;
   {
     nb::gil_scoped_release release;
-    kept = vtslam::visible_points(points.data(), normals.data(), static_cast<int64_t>(count), T.R, T.t, view,
-                                  tolerance, packed);
+    kept = vtslam::visible_points(points.data(), normals.data(), static_cast<int64_t>(count), T.R, T.t, view, tolerance,
+                                  packed);
   }
   return Out<float, 2>(packed, {static_cast<size_t>(kept), 6}, owner);
 }
