@@ -41,6 +41,11 @@ class SmoothRoom:
         points = (rays * z[..., None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
         return self._color(points).astype(np.float32), z.astype(np.float32)
 
+    def normals(self, points_world_m: Array) -> Array:
+        """Outward unit normals [...,3] at points of the surface [...,3], world."""
+        gradient = points_world_m / np.square(self.radii_m)
+        return np.asarray(gradient / np.linalg.norm(gradient, axis=-1, keepdims=True))
+
     def rendering(self, T_world_camera: Array, camera: Camera) -> Rendering:
         """The view as a rasteriser would give it, fully covered."""
         rgb, depth_m = self.view(T_world_camera, camera)

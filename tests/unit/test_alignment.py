@@ -89,7 +89,7 @@ def reference_of(room: SmoothRoom, *, levels: int = 1, margin: int = 0) -> Refer
     """The room from START, with a point at every pixel; a margin keeps what is warped away from the image's border."""
     rendering = room.rendering(START, CAMERA)
     points = CAMERA.back_projected(rendering.depth_m)
-    normals = normals_from_depth(rendering.depth_m, CAMERA)
+    normals = room.normals(points @ START[:3, :3].T + START[:3, 3]) @ START[:3, :3]
     inner = np.ones(rendering.alpha.shape, np.bool_)
     if margin:
         inner[:margin], inner[-margin:], inner[:, :margin], inner[:, -margin:] = False, False, False, False
@@ -99,7 +99,7 @@ def reference_of(room: SmoothRoom, *, levels: int = 1, margin: int = 0) -> Refer
         CAMERA,
         np.eye(4),
         means_m=points.reshape(-1, 3),
-        normals=normals.reshape(-1, 3),
+        normals=normals.reshape(-1, 3).astype(np.float32),
         levels=levels,
         silhouette_threshold=0.9,
     )
@@ -308,25 +308,34 @@ def test_a_view_shows_the_points_that_are_as_deep_as_it_was_rendered() -> None:
     assert len(covered.points) == 10 * CAMERA.height
 
 
-def test_normals_are_those_of_the_surface_and_zero_where_unknown() -> None:
+def test_normals_are_those_of_the_surface_on_both_sides_of_a_step() -> None:
+    camera = small_camera(128, 96)
     room = SmoothRoom()
-    _, depth_m = room.view(START, CAMERA)
-    depth_m[20, 30] = 0.0
-    depth_m[:, 50:] += 0.6  # a step
+    _, depth_m = room.view(START, camera)
+    true = room.normals(camera.back_projected(depth_m) @ START[:3, :3].T + START[:3, 3]) @ START[:3, :3]
+    depth_m[:, 80:] *= 1.3  # nearer surface and farther surface, each as it was
+    normals = normals_from_depth(depth_m, camera)
+    lengths = np.linalg.norm(normals, axis=-1)
+    known = lengths > 0
+    assert known[8:-8, 8:-8].mean() > 0.9
+    np.testing.assert_allclose(lengths[known], 1.0, atol=1e-5)
+    left = known & (np.arange(camera.width) < 80)
+    assert np.abs((normals * true).sum(-1))[left].min() > 0.99
+    # All of one surface face the same way.
+    assert len(np.unique(np.sign((normals * camera.pixel_rays()).sum(-1))[left])) == 1
+
+
+def test_pixels_without_surface_around_them_have_no_normal() -> None:
+    depth_m = np.zeros((48, 64), np.float32)
+    depth_m[20, 30] = 2.0
+    assert not normals_from_depth(depth_m, CAMERA).any()
+    depth_m[20, :] = 2.0  # a line has no normal either
+    assert not normals_from_depth(depth_m, CAMERA).any()
+    depth_m[:] = 2.0
+    depth_m[10, 12] = 0.0
     normals = normals_from_depth(depth_m, CAMERA)
-    known = np.linalg.norm(normals, axis=-1) > 0
-    np.testing.assert_allclose(np.linalg.norm(normals[known], axis=-1), 1.0, atol=1e-5)
-    unknown = np.zeros_like(known)
-    unknown[0], unknown[-1], unknown[:, 0], unknown[:, -1] = True, True, True, True
-    unknown[20, 29:32], unknown[19:22, 30] = True, True
-    unknown[:, 49:51] = True
-    np.testing.assert_array_equal(known, ~unknown)
-    points = CAMERA.back_projected(depth_m).astype(np.float64) @ START[:3, :3].T + START[:3, 3]
-    gradient = (points / np.square(room.radii_m)) @ START[:3, :3]
-    true = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
-    left = known & (np.arange(CAMERA.width) < 49)
-    cosine = np.abs((normals * true).sum(-1))[left]
-    assert cosine.min() > 0.999
+    assert not normals[10, 12].any()
+    np.testing.assert_allclose(np.abs(normals[20:40, 20:40]), np.broadcast_to([0, 0, 1], (20, 20, 3)), atol=1e-6)
 
 
 def aligned(
