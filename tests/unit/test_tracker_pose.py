@@ -89,6 +89,19 @@ def test_adam_keeps_the_best_pose_it_saw() -> None:
     assert losses[-1] < losses[0]
 
 
+def test_adam_does_not_keep_a_pose_that_is_worse_than_its_guess() -> None:
+    section, frame = FixedMap.of(smooth_section()), ROOM.frame(pose(1), CAMERA, frame_id=1)
+    losses = []
+    for iterations in (1, 3):
+        adam = replace(ADAM, first_section_iterations=iterations, learning_rate_translation=0.3)
+        result = tracker(TrackerSettings(optimizer="adam", adam=adam)).track(
+            frame, section, TrackerState(), section_id=0, is_head=False, guess=pose(1)
+        )
+        losses.append((result.quality.color_loss, result.quality.depth_loss_m))
+        assert pose_error(result.T_world_camera, pose(1))[0] < 1e-9
+    assert losses[0] == losses[1]
+
+
 def test_section_zero_has_its_own_number_of_iterations() -> None:
     frame, guess = ROOM.frame(pose(2), CAMERA, frame_id=2), pose(2)
     section = smooth_section()
