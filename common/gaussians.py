@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.common.optim.surface import normals_from_depth
 from vtslam.common.splat.engine import Splats
 
 # Offset of a Gaussian from its pixel's centre in pixels, by ``subpixel``: 0 is the pixel itself, 1 to 4 the four
@@ -105,23 +104,6 @@ class ViewTiedGaussians:
             rows = self.frame_index == index
             T = T_section_frames[index]
             out[rows] = points[rows] @ T[:3, :3].T + T[:3, 3]
-        return out
-
-    def normals(
-        self, camera: Camera, T_section_frames: npt.NDArray[np.float64], *, depth_unit_m: float
-    ) -> npt.NDArray[np.float32]:
-        """Unit surface normals float32 [N,3] in the section's frame; zero where a Gaussian's neighbours are unknown.
-
-        Computed per frame from the depths of the Gaussians tied to it, so a section read back has the same normals.
-        """
-        out = np.zeros((self.count, 3), np.float32)
-        for index in np.unique(self.frame_index):
-            rows = np.flatnonzero((self.frame_index == index) & (self.subpixel == 0))
-            depth_m = np.zeros(camera.width * camera.height, np.float32)
-            depth_m[self.pixel[rows]] = self.depth[rows] * depth_unit_m
-            image = normals_from_depth(depth_m.reshape(camera.height, camera.width), camera)
-            rotation = T_section_frames[index][:3, :3]
-            out[rows] = image.reshape(-1, 3)[self.pixel[rows]] @ rotation.T
         return out
 
     def splats(self, means_m: npt.NDArray[np.float32]) -> Splats:

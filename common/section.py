@@ -8,6 +8,7 @@ import numpy.typing as npt
 from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
+from vtslam.common.optim.surface import measured_surface
 from vtslam.common.splat.engine import Splats
 
 
@@ -41,7 +42,8 @@ class Section:
         frames: The frame table.
         gaussians: The Gaussians tied to those frames.
         means_m: float32 [N,3], their positions in section coordinates; recomputed from the rest, never stored.
-        normals: float32 [N,3], surface normals there (zero where unknown); recomputed likewise.
+        surface: float32 [M,6], points (m) and normals that its views with depth measured, in section coordinates; what
+            frames are aligned to. Recomputed likewise.
     """
 
     section_id: int
@@ -52,28 +54,32 @@ class Section:
     frames: tuple[SectionFrame, ...]
     gaussians: ViewTiedGaussians
     means_m: npt.NDArray[np.float32]
-    normals: npt.NDArray[np.float32]
+    surface: npt.NDArray[np.float32]
 
     def retied(self) -> "Section":
-        """The section with positions and normals computed anew from its frames' poses."""
-        means, normals = self.surface_of(self.gaussians)
-        return replace(self, means_m=means, normals=normals)
+        """The section with positions and surface computed anew from its frames' poses."""
+        parts = [self._surface_of(frame) for frame in self.frames]
+        surface = np.concatenate([np.zeros((0, 6), np.float32), *parts])
+        return replace(self, means_m=self._means_of(self.gaussians), surface=surface)
 
-    def grown(self, new: ViewTiedGaussians) -> "Section":
-        """The section with more Gaussians, tied to frames of its table that had none."""
-        means, normals = self.surface_of(new)
+    def grown(self, frame: SectionFrame, new: ViewTiedGaussians) -> "Section":
+        """The section with one more frame and the Gaussians tied to it."""
+        longer = replace(self, frames=(*self.frames, frame))
         return replace(
-            self,
+            longer,
             gaussians=self.gaussians.appended(new),
-            means_m=np.concatenate([self.means_m, means]),
-            normals=np.concatenate([self.normals, normals]),
+            means_m=np.concatenate([self.means_m, longer._means_of(new)]),
+            surface=np.concatenate([self.surface, self._surface_of(frame)]),
         )
 
-    def surface_of(self, gaussians: ViewTiedGaussians) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Positions and normals, float32 [N,3] each, of Gaussians tied to this section's frames."""
-        poses = np.stack([f.T_section_frame for f in self.frames]) if self.frames else np.zeros((0, 4, 4))
-        means = gaussians.means_m(self.camera, poses, depth_unit_m=self.depth_unit_m)
-        return means, gaussians.normals(self.camera, poses, depth_unit_m=self.depth_unit_m)
+    def _means_of(self, gaussians: ViewTiedGaussians) -> npt.NDArray[np.float32]:
+        poses = np.stack([f.T_section_frame for f in self.frames])
+        return gaussians.means_m(self.camera, poses, depth_unit_m=self.depth_unit_m)
+
+    def _surface_of(self, frame: SectionFrame) -> npt.NDArray[np.float32]:
+        if frame.view_depth is None:
+            return np.zeros((0, 6), np.float32)
+        return measured_surface(frame.view_depth, self.camera, frame.T_section_frame, depth_scale_m=self.depth_scale_m)
 
     @property
     def depth_unit_m(self) -> float:

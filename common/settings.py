@@ -141,11 +141,11 @@ class GaussNewtonSettings:
     converged_rad: Positive = 1e-5
     silhouette_threshold: Fraction = 0.9
     color_sigma: Positive = 0.03
-    color_weight: NonNegative = 1.0
+    color_weight: NonNegative = 0.05
     depth_weight: NonNegative = 1.0
     depth_sigma_base_m: Positive = 0.002
     depth_sigma_per_m: NonNegative = 0.0015
-    depth_gate_sigmas: Positive = 10.0
+    depth_gate_sigmas: Positive = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

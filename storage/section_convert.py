@@ -65,7 +65,7 @@ def section_of(record: SectionRecord) -> Section:
         frames=frames,
         gaussians=gaussians,
         means_m=np.zeros((0, 3), np.float32),
-        normals=np.zeros((0, 3), np.float32),
+        surface=np.zeros((0, 6), np.float32),
     ).retied()
 
 

@@ -15,7 +15,7 @@ from vtslam.common.splat.engine import Rendering
 FloatImage = npt.NDArray[np.float32]
 
 _MAX_RELATIVE_DEPTH_STEP = 0.05  # pixels further apart than this are not merged in a pyramid
-_VISIBLE_TOLERANCE = 0.03  # relative; a Gaussian this near to the rendered depth is what the view shows
+_VISIBLE_TOLERANCE = 0.03  # relative; a point this near to the rendered depth is what the view shows
 _BORDER_PX = 1.0
 _MIN_MEASUREMENTS = 30  # six unknowns need a margin
 _DAMPING = 1e-6  # of H's diagonal: keeps a flat wall solvable
@@ -45,7 +45,7 @@ class Reference:
 
     Attributes:
         levels: Colour pyramid, finest first.
-        points: float32 [M,6], the view-tied Gaussians it shows: position (m) and normal, rendered camera's frame.
+        points: float32 [M,6], the measured points it shows: position (m) and normal, rendered camera's frame.
     """
 
     levels: list[ReferenceLevel]
@@ -126,21 +126,20 @@ def reference_view(
     camera: Camera,
     T_camera_map: npt.NDArray[np.float64],
     *,
-    means_m: FloatImage,
-    normals: FloatImage,
+    surface: FloatImage,
     levels: int,
     silhouette_threshold: float,
 ) -> Reference:
     """A rendered view ready for alignment, colour and depth divided by the silhouette where that is high.
 
     Depth accumulated front to back leans towards the camera on slanted surfaces, so distances are not measured to it:
-    it only tells which Gaussians the view shows (means_m and normals float32 [N,3], map frame), and they are exact.
+    it only tells which of the map's measured points (``surface`` float32 [M,6], map frame) the view shows.
     """
     covered = rendering.alpha > max(silhouette_threshold, 1e-3)
     inverse = np.where(covered, 1.0 / np.maximum(rendering.alpha, 1e-3), 0.0).astype(np.float32)
     rgb, depth_m = rendering.rgb * inverse[..., None], rendering.depth_m * inverse
     points = _align.visible_points(
-        means_m, normals, np.ascontiguousarray(T_camera_map), depth_m, _intrinsics(camera), _VISIBLE_TOLERANCE
+        surface, np.ascontiguousarray(T_camera_map), depth_m, _intrinsics(camera), _VISIBLE_TOLERANCE
     )
     mask = covered.astype(np.uint8)
     pyramid = []

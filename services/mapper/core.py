@@ -45,10 +45,10 @@ class Mapper:
             camera=frame.camera,
             depth_scale_m=frame.depth_scale_m,
             depth_factor=self.settings.depth_factor,
-            frames=(self._section_frame(frame, np.eye(4), 0),),
+            frames=(self._section_frame(frame, np.eye(4), 0, held_out=False),),
             gaussians=self._tied(frame, frame.depth > 0, 0),
             means_m=np.zeros((0, 3), np.float32),
-            normals=np.zeros((0, 3), np.float32),
+            surface=np.zeros((0, 6), np.float32),
         ).retied()
         view = TrainingView(frame_index=0, frame=frame)
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None)
@@ -87,19 +87,17 @@ class Mapper:
         """
         row = len(active.section.frames)
         T_section_frame = active.section.T_section_camera(T_world_camera)
-        stored = self._section_frame(frame, T_section_frame, row)
-        section = replace(active.section, frames=(*active.section.frames, stored))
-        views, added = active.views, 0
+        new, views = ViewTiedGaussians.empty(), active.views
         if not held_out:
-            new = self._tied(frame, self._uncovered(section, frame, T_section_frame), row)
-            section, added = section.grown(new), new.count
+            new = self._tied(frame, self._uncovered(active.section, frame, T_section_frame), row)
             views = (*views, TrainingView(frame_index=row, frame=frame))
+        section = active.section.grown(self._section_frame(frame, T_section_frame, row, held_out=held_out), new)
         chosen = self._random_views(frame.frame_id, len(views), self.settings.iterations_regular)
         result = self._optimised(section, neighbours, active, views, chosen)
         grown = ActiveSection(
             section=result.section, views=views, neighbour_ids=active.neighbour_ids, moments=result.moments
         )
-        return grown, self._record(frame, grown, result, added, len(chosen), held_out=held_out)
+        return grown, self._record(frame, grown, result, new.count, len(chosen), held_out=held_out)
 
     def seal(self, active: ActiveSection, *, neighbours: list[Section]) -> tuple[Section, int]:
         """Finish a section: a last round over all its views; afterwards its payload never changes.
@@ -115,7 +113,8 @@ class Mapper:
         last = active.views[-1]
         frames = list(section.frames)
         frames[last.frame_index] = replace(frames[last.frame_index], view_depth=last.frame.depth)
-        return replace(section, frames=tuple(frames)), result.renders
+        # Computed anew, so that a section in memory and the same one read back agree to the bit.
+        return replace(section, frames=tuple(frames)).retied(), result.renders
 
     def _optimised(
         self,
@@ -132,8 +131,12 @@ class Mapper:
                 optimiser.step(views[index], with_neighbours=index == 0)
         return optimiser.finished()
 
-    def _section_frame(self, frame: Frame, T_section_frame: npt.NDArray[np.float64], row: int) -> SectionFrame:
-        keeps_depth = row % self.section_settings.candidate_interval == 0 or row == self.section_settings.length // 2
+    def _section_frame(
+        self, frame: Frame, T_section_frame: npt.NDArray[np.float64], row: int, *, held_out: bool
+    ) -> SectionFrame:
+        """A row of the frame table; candidate views and the middle frame keep their depth."""
+        s = self.section_settings
+        keeps_depth = not held_out and (row % s.candidate_interval == 0 or row == s.length // 2)
         return SectionFrame(
             frame_id=frame.frame_id,
             capture_time_ns=frame.capture_time_ns,

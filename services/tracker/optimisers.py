@@ -184,8 +184,7 @@ class _GaussNewton:
                 rendering,
                 self._camera,
                 T,
-                means_m=section.means_m,
-                normals=section.normals,
+                surface=section.surface,
                 levels=coarsest + 1,
                 silhouette_threshold=s.silhouette_threshold,
             )

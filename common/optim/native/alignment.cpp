@@ -234,21 +234,20 @@ NormalEquations normal_equations(const ReferenceView& reference, const ObservedV
   return total;
 }
 
-int64_t visible_points(const float* points, const float* normals, int64_t count, const double R[9], const double t[3],
-                       const RenderedDepth& rendered, float tolerance, float* packed) {
+int64_t visible_points(const ReferencePoints& map, const double R[9], const double t[3], const RenderedDepth& rendered,
+                       float tolerance, float* packed) {
   const Motion motion(R, t);
   const Pinhole& camera = rendered.camera;
   int64_t kept = 0;
-  for (int64_t i = 0; i < count; ++i) {
-    const float* n = normals + 3 * i;
-    if (n[0] == 0.0f && n[1] == 0.0f && n[2] == 0.0f) continue;
-    const Point p = motion.moved({points[3 * i], points[3 * i + 1], points[3 * i + 2]});
+  for (int64_t i = 0; i < map.count; ++i) {
+    const float* point = map.packed + 6 * i;
+    const Point p = motion.moved({point[0], point[1], point[2]});
     if (!(p.z > 0.01f)) continue;
     const float u = camera.fx * p.x / p.z + camera.cx, v = camera.fy * p.y / p.z + camera.cy;
     if (!(u >= 0.0f && v >= 0.0f && u < rendered.width && v < rendered.height)) continue;
     const float d = rendered.depth[static_cast<size_t>(v) * rendered.width + static_cast<size_t>(u)];
     if (!(d > 0.0f && std::fabs(d - p.z) <= tolerance * p.z)) continue;
-    const Point q = motion.rotated({n[0], n[1], n[2]});
+    const Point q = motion.rotated({point[3], point[4], point[5]});
     float* row = packed + 6 * kept++;
     row[0] = p.x;
     row[1] = p.y;
@@ -260,30 +259,68 @@ int64_t visible_points(const float* points, const float* normals, int64_t count,
   return kept;
 }
 
+namespace {
+
+// Least squares of inverse depth as an affine function of the pixel, over a window: exact for planes.
+struct PlaneFit {
+  double n = 0, u = 0, v = 0, uu = 0, uv = 0, vv = 0, r = 0, ru = 0, rv = 0;
+
+  void add(double du, double dv, double inverse_depth) {
+    n += 1;
+    u += du;
+    v += dv;
+    uu += du * du;
+    uv += du * dv;
+    vv += dv * dv;
+    r += inverse_depth;
+    ru += inverse_depth * du;
+    rv += inverse_depth * dv;
+  }
+
+  // Slopes of inverse depth per pixel; false where the samples lie on a line.
+  bool slopes(double& a, double& b) const {
+    const double suu = uu - u * u / n, suv = uv - u * v / n, svv = vv - v * v / n;
+    const double sru = ru - r * u / n, srv = rv - r * v / n;
+    const double determinant = suu * svv - suv * suv;
+    if (!(determinant > 1e-3 * suu * svv) || !(suu * svv > 0)) return false;
+    a = (sru * svv - srv * suv) / determinant;
+    b = (srv * suu - sru * suv) / determinant;
+    return true;
+  }
+};
+
+constexpr int kWindowRadius = 4, kWindowStride = 2, kMinSamples = 9;
+
+}  // namespace
+
 void normals_from_depth(const float* depth, int width, int height, const Pinhole& camera, float max_relative_step,
                         float* normals) {
   std::memset(normals, 0, sizeof(float) * 3 * width * static_cast<size_t>(height));
-  auto point = [&](int u, int v, float z) {
-    return Point{(u + 0.5f - camera.cx) / camera.fx * z, (v + 0.5f - camera.cy) / camera.fy * z, z};
-  };
-  for (int v = 1; v + 1 < height; ++v) {
-    for (int u = 1; u + 1 < width; ++u) {
+  for (int v = 0; v < height; ++v) {
+    for (int u = 0; u < width; ++u) {
       const size_t i = static_cast<size_t>(v) * width + u;
-      const float z = depth[i], left = depth[i - 1], right = depth[i + 1], up = depth[i - width],
-                  down = depth[i + width];
-      if (!(z > 0 && left > 0 && right > 0 && up > 0 && down > 0)) continue;
-      const float step = std::max(std::max(std::fabs(left - z), std::fabs(right - z)),
-                                  std::max(std::fabs(up - z), std::fabs(down - z)));
-      if (step > max_relative_step * z) continue;
-      const Point a = point(u + 1, v, right), b = point(u - 1, v, left), c = point(u, v + 1, down),
-                  d = point(u, v - 1, up);
-      const Point s{a.x - b.x, a.y - b.y, a.z - b.z}, r{c.x - d.x, c.y - d.y, c.z - d.z};
-      const Point n{r.y * s.z - r.z * s.y, r.z * s.x - r.x * s.z, r.x * s.y - r.y * s.x};
-      const float length = std::sqrt(n.x * n.x + n.y * n.y + n.z * n.z);
+      const float z = depth[i];
+      if (!(z > 0)) continue;
+      PlaneFit fit;
+      for (int dv = -kWindowRadius; dv <= kWindowRadius; dv += kWindowStride) {
+        if (v + dv < 0 || v + dv >= height) continue;
+        for (int du = -kWindowRadius; du <= kWindowRadius; du += kWindowStride) {
+          if (u + du < 0 || u + du >= width) continue;
+          const float d = depth[i + static_cast<std::ptrdiff_t>(dv) * width + du];
+          if (d > 0 && std::fabs(d - z) <= max_relative_step * z) fit.add(du, dv, 1.0 / d);
+        }
+      }
+      double a, b;
+      if (fit.n < kMinSamples || !fit.slopes(a, b)) continue;
+      // Plane n . X = 1 gives 1/z = n . ray: its slopes per pixel are n_x / fx and n_y / fy.
+      const double nx = a * camera.fx, ny = b * camera.fy;
+      const double nz = fit.r / fit.n - a * fit.u / fit.n - b * fit.v / fit.n - nx * (u + 0.5 - camera.cx) / camera.fx -
+                        ny * (v + 0.5 - camera.cy) / camera.fy;
+      const double length = std::sqrt(nx * nx + ny * ny + nz * nz);
       if (!(length > 0)) continue;
-      normals[3 * i] = n.x / length;
-      normals[3 * i + 1] = n.y / length;
-      normals[3 * i + 2] = n.z / length;
+      normals[3 * i] = static_cast<float>(nx / length);
+      normals[3 * i + 1] = static_cast<float>(ny / length);
+      normals[3 * i + 2] = static_cast<float>(nz / length);
     }
   }
 }

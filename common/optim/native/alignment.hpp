@@ -17,7 +17,7 @@ struct ReferenceView {
   const uint8_t* mask;  // [H,W], 0 leaves the pixel out
 };
 
-// Map points for the depth term, in the rendered camera's frame: position (3) and unit normal (3).
+// Measured points for the depth term: position (3) and unit normal (3).
 struct ReferencePoints {
   const float* packed;  // [M,6]
   int64_t count;
@@ -67,12 +67,13 @@ NormalEquations normal_equations(const ReferenceView& reference, const ObservedV
                                  const ReferencePoints& points, const DepthView& depth, const double R[9],
                                  const double t[3], const AlignmentOptions& options, int threads);
 
-// Points that a rendered view shows: inside its image, covered, and as deep as it was rendered. Writes position and
-// normal in the camera's frame to `packed` (room for `count` rows) and returns how many.
-int64_t visible_points(const float* points, const float* normals, int64_t count, const double R[9], const double t[3],
-                       const RenderedDepth& rendered, float tolerance, float* packed);
+// Map points that a rendered view shows: inside its image, covered, and as deep as it was rendered. Writes them in the
+// camera's frame to `packed` (room for all) and returns how many.
+int64_t visible_points(const ReferencePoints& map, const double R[9], const double t[3], const RenderedDepth& rendered,
+                       float tolerance, float* packed);
 
-// Unit normals [H,W,3] of a depth image by central differences; zero at borders, holes and depth steps.
+// Unit normals [H,W,3] of a depth image by a plane fit over a 9x9 window; zero where there is too little surface.
+// A window this wide is needed: a Kinect's depth steps are as large as its pixels are apart.
 void normals_from_depth(const float* depth, int width, int height, const Pinhole& camera, float max_relative_step,
                         float* normals);
 

@@ -87,11 +87,10 @@ System normal_equations(In<float, 3> rgb, In<float, 2> depth, In<uint8_t, 2> mas
                 out.color_count, out.depth_count);
 }
 
-Out<float, 2> visible_points(In<float, 2> points, In<float, 2> normals, In<double, 2> T_camera_map, In<float, 2> depth,
-                             Intrinsics camera, float tolerance) {
+Out<float, 2> visible_points(In<float, 2> points, In<double, 2> T_camera_map, In<float, 2> depth, Intrinsics camera,
+                             float tolerance) {
   const size_t count = points.shape(0);
-  require(points, {count, 3}, "points");
-  require(normals, {count, 3}, "normals");
+  require(points, {count, 6}, "points");
   const Transform T(T_camera_map);
   const vtslam::RenderedDepth view{depth.data(), static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)),
                                    pinhole(camera)};
@@ -100,8 +99,7 @@ Out<float, 2> visible_points(In<float, 2> points, In<float, 2> normals, In<doubl
   int64_t kept;
   {
     nb::gil_scoped_release release;
-    kept = vtslam::visible_points(points.data(), normals.data(), static_cast<int64_t>(count), T.R, T.t, view, tolerance,
-                                  packed);
+    kept = vtslam::visible_points({points.data(), static_cast<int64_t>(count)}, T.R, T.t, view, tolerance, packed);
   }
   return Out<float, 2>(packed, {static_cast<size_t>(kept), 6}, owner);
 }
@@ -159,8 +157,8 @@ NB_MODULE(_align, m) {
   m.def("normal_equations", &normal_equations, "rgb"_a, "depth"_a, "mask"_a, "packed"_a, "camera"_a, "points"_a,
         "frame_depth"_a, "frame_camera"_a, "T_observed_reference"_a, "options"_a, "threads"_a,
         "H [6,6], g [6], colour cost, depth cost, colour count, depth count.");
-  m.def("visible_points", &visible_points, "points"_a, "normals"_a, "T_camera_map"_a, "depth"_a, "camera"_a,
-        "tolerance"_a, "Points [M,6] (position, normal; camera frame) that a rendered depth image shows.");
+  m.def("visible_points", &visible_points, "points"_a, "T_camera_map"_a, "depth"_a, "camera"_a, "tolerance"_a,
+        "Points [M,6] (position, normal; camera frame) that a rendered depth image shows.");
   m.def("normals_from_depth", &normals_from_depth, "depth"_a, "camera"_a, "max_relative_step"_a,
         "Unit normals [H,W,3] of a depth image (m); zero where unknown.");
   m.def("tracking_loss", &tracking_loss, "rgb"_a, "depth"_a, "alpha"_a, "target_rgb"_a, "target_depth"_a, "mask"_a,
