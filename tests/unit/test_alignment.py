@@ -94,15 +94,8 @@ def reference_of(room: SmoothRoom, *, levels: int = 1, margin: int = 0) -> Refer
     if margin:
         inner[:margin], inner[-margin:], inner[:, :margin], inner[:, -margin:] = False, False, False, False
     rendering = replace(rendering, alpha=np.where(inner, rendering.alpha, np.float32(0)))
-    return reference_view(
-        rendering,
-        CAMERA,
-        np.eye(4),
-        means_m=points.reshape(-1, 3),
-        normals=normals.reshape(-1, 3).astype(np.float32),
-        levels=levels,
-        silhouette_threshold=0.9,
-    )
+    surface = np.concatenate([points, normals], axis=-1).reshape(-1, 6).astype(np.float32)
+    return reference_view(rendering, CAMERA, np.eye(4), surface=surface, levels=levels, silhouette_threshold=0.9)
 
 
 def observed_of(room: SmoothRoom, T_world_camera: Array, *, levels: int = 1) -> Observed:
@@ -286,26 +279,20 @@ def test_a_view_shows_the_points_that_are_as_deep_as_it_was_rendered() -> None:
     T_camera_map = motion(3, metres=0.5, degrees=20.0)
     to_map = se3.inverse(T_camera_map)
 
-    def shown(points_camera: npt.NDArray[np.float32], normals: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        means = (points_camera @ to_map[:3, :3].T + to_map[:3, 3]).astype(np.float32)
-        turned = (normals @ to_map[:3, :3].T).astype(np.float32)
-        return reference_view(
-            rendering, CAMERA, T_camera_map, means_m=means, normals=turned, levels=1, silhouette_threshold=0.9
-        ).points
+    def shown(points_camera: npt.NDArray[np.float32], seen: Rendering = rendering) -> npt.NDArray[np.float32]:
+        points = points_camera @ to_map[:3, :3].T + to_map[:3, 3]
+        surface = np.concatenate([points, towards @ to_map[:3, :3].T], axis=1).astype(np.float32)
+        return reference_view(seen, CAMERA, T_camera_map, surface=surface, levels=1, silhouette_threshold=0.9).points
 
-    points = shown(pixels, towards)
+    points = shown(pixels)
     assert points.shape == (len(pixels), 6)
     np.testing.assert_allclose(points[:, :3], pixels, atol=1e-5)
     np.testing.assert_allclose(points[:, 3:], towards, atol=1e-5)
-    assert len(shown(pixels * np.float32(1.2), towards)) == 0  # behind what the view shows
-    assert len(shown(pixels * np.float32(0.8), towards)) == 0
-    assert len(shown(-pixels, towards)) == 0
-    assert len(shown(pixels, 0 * towards)) == 0  # no surface
+    assert len(shown(pixels * np.float32(1.2))) == 0  # behind what the view shows
+    assert len(shown(pixels * np.float32(0.8))) == 0
+    assert len(shown(-pixels)) == 0
     bare = replace(rendering, alpha=np.where(np.arange(CAMERA.width) < 10, rendering.alpha, np.float32(0)))
-    covered = reference_view(
-        bare, CAMERA, np.eye(4), means_m=pixels, normals=towards, levels=1, silhouette_threshold=0.9
-    )
-    assert len(covered.points) == 10 * CAMERA.height
+    assert len(shown(pixels, bare)) == 10 * CAMERA.height
 
 
 def test_normals_are_those_of_the_surface_on_both_sides_of_a_step() -> None:
@@ -445,8 +432,9 @@ def test_a_flat_grey_wall_does_not_break_the_solver() -> None:
         Rendering(rgb=rgb, depth_m=depth_m, alpha=np.ones_like(depth_m), saved=None),
         CAMERA,
         np.eye(4),
-        means_m=CAMERA.back_projected(depth_m).reshape(-1, 3),
-        normals=normals_from_depth(depth_m, CAMERA).reshape(-1, 3),
+        surface=np.concatenate([CAMERA.back_projected(depth_m), normals_from_depth(depth_m, CAMERA)], -1).reshape(
+            -1, 6
+        ),
         levels=1,
         silhouette_threshold=0.9,
     )
@@ -484,13 +472,11 @@ def test_pyramids_halve_images_and_camera_and_drop_uncertain_pixels() -> None:
 def levels_of(
     rgb: npt.NDArray[np.float32], depth_m: npt.NDArray[np.float32], alpha: npt.NDArray[np.float32], *, levels: int
 ) -> Reference:
-    none = np.zeros((0, 3), np.float32)
     return reference_view(
         Rendering(rgb=rgb, depth_m=depth_m, alpha=alpha, saved=None),
         small_camera(alpha.shape[1], alpha.shape[0]),
         np.eye(4),
-        means_m=none,
-        normals=none,
+        surface=np.zeros((0, 6), np.float32),
         levels=levels,
         silhouette_threshold=0.5,
     )

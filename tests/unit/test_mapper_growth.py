@@ -55,7 +55,7 @@ def test_a_head_gets_a_gaussian_at_every_pixel_with_depth() -> None:
     assert record.gaussians_added == record.gaussians == active.section.gaussians.count == valid
     np.testing.assert_array_equal(active.section.gaussians.pixel, np.flatnonzero(frame.depth))
     assert not active.section.gaussians.frame_index.any()
-    assert active.section.means_m.shape == active.section.normals.shape == (valid, 3)
+    assert active.section.means_m.shape == (valid, 3)
 
 
 def test_the_edge_supplement_adds_four_on_edges() -> None:

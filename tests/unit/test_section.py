@@ -23,7 +23,14 @@ def small_section(section_id: int = 0, T_world_section: npt.NDArray[np.float64] 
         frame = SmoothRoom().frame(T_world_section @ T_section_frame, CAMERA, frame_id=row)
         new = tied_to_frame(frame, frame.depth > 0, frame_index=row, depth_factor=1.01, opacity=0.9)
         gaussians = new if gaussians is None else gaussians.appended(new)
-        frames.append(SectionFrame(frame_id=row, capture_time_ns=row, T_section_frame=T_section_frame))
+        frames.append(
+            SectionFrame(
+                frame_id=row,
+                capture_time_ns=row,
+                T_section_frame=T_section_frame,
+                view_depth=None if row else frame.depth,
+            )
+        )
     assert gaussians is not None
     return Section(
         section_id=section_id,
@@ -34,7 +41,7 @@ def small_section(section_id: int = 0, T_world_section: npt.NDArray[np.float64] 
         frames=tuple(frames),
         gaussians=gaussians,
         means_m=np.zeros((0, 3), np.float32),
-        normals=np.zeros((0, 3), np.float32),
+        surface=np.zeros((0, 6), np.float32),
     ).retied()
 
 
@@ -55,28 +62,31 @@ def test_growing_gives_the_same_as_tying_anew() -> None:
     section = small_section()
     frame = SmoothRoom().frame(START @ STEP @ STEP, CAMERA, frame_id=2)
     new = tied_to_frame(frame, frame.depth > 0, frame_index=2, depth_factor=1.01, opacity=0.9)
-    row = SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP)
-    grown = replace(section, frames=(*section.frames, row)).grown(new)
+    row = SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP, view_depth=frame.depth)
+    grown = section.grown(row, new)
     own = section.gaussians.count
     assert grown.gaussians.count == own + new.count
+    assert [f.frame_id for f in grown.frames] == [0, 1, 2]
     assert grown.means_m[:own].tobytes() == section.means_m.tobytes()
     again = grown.retied()
     assert again.means_m.tobytes() == grown.means_m.tobytes()
-    assert again.normals.tobytes() == grown.normals.tobytes()
+    assert again.surface.tobytes() == grown.surface.tobytes()
+    assert len(grown.surface) > len(section.surface) > 0
 
 
-def test_normals_are_unit_and_face_along_the_surface() -> None:
+def test_the_surface_is_what_the_views_with_depth_measured() -> None:
     section = small_section()
-    lengths = np.linalg.norm(section.normals, axis=1)
-    inner = lengths > 0
-    assert inner.mean() > 0.3
-    np.testing.assert_allclose(lengths[inner], 1.0, atol=1e-5)
-    # The ellipsoid's own normals, in section coordinates.
-    world = section.means_m / section.depth_factor @ START[:3, :3].T + START[:3, 3]
-    true = SmoothRoom().normals(world) @ START[:3, :3]
-    cosine = np.abs((true * section.normals).sum(axis=1))
+    points, normals = section.surface[:, :3], section.surface[:, 3:]
+    assert len(section.surface) > 50
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+    room = SmoothRoom()
+    world = points @ START[:3, :3].T + START[:3, 3]
+    np.testing.assert_allclose(np.square(world / room.radii_m).sum(axis=1), 1.0, atol=1e-3)
     # The image is small: estimates that look at several pixels see the surface bend.
-    assert cosine[inner & (section.gaussians.frame_index == 0)].min() > 0.9
+    assert np.abs((room.normals(world) @ START[:3, :3] * normals).sum(axis=1)).min() > 0.9
+    blind = replace(section, frames=tuple(replace(f, view_depth=None) for f in section.frames)).retied()
+    assert blind.surface.shape == (0, 6)
+    assert blind.means_m.tobytes() == section.means_m.tobytes()
 
 
 def test_the_anchor_moves_the_world_pose_of_every_frame_but_no_position() -> None:
@@ -91,23 +101,6 @@ def test_the_anchor_moves_the_world_pose_of_every_frame_but_no_position() -> Non
 def test_world_and_section_poses_are_inverse_to_each_other() -> None:
     section = small_section()
     np.testing.assert_allclose(section.T_section_camera(section.T_world_frame(1)), STEP, atol=1e-12)
-
-
-def test_a_section_without_frames_has_no_positions() -> None:
-    section = small_section()
-    none = np.zeros(section.gaussians.count, np.bool_)
-    g = section.gaussians
-    empty = replace(
-        g,
-        frame_index=g.frame_index[none],
-        pixel=g.pixel[none],
-        subpixel=g.subpixel[none],
-        depth=g.depth[none],
-        colors=g.colors[none],
-        log_radii=g.log_radii[none],
-        opacity_logits=g.opacity_logits[none],
-    )
-    assert replace(section, frames=(), gaussians=empty).retied().means_m.shape == (0, 3)
 
 
 def test_joined_sections_keep_their_world_positions_and_order() -> None:

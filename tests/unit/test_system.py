@@ -135,7 +135,7 @@ def test_reloaded_sections_are_equal_to_those_in_memory() -> None:
     for section_id, section in result.archive.written.items():
         again = result.archive.read(section_id)
         assert section_bytes(again) == section_bytes(section)
-        assert again.normals.tobytes() == section.normals.tobytes()
+        assert again.surface.tobytes() == section.surface.tobytes()
 
 
 def test_sections_that_left_memory_come_back_from_the_archive(monkeypatch: pytest.MonkeyPatch) -> None:
