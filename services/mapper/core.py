@@ -65,7 +65,7 @@ class Mapper:
             moments=result.moments,
         )
         added = section.gaussians.count
-        return active, self._record(frame, active, result, added, self.settings.iterations_head, held_out=False)
+        return active, self._record(frame, active, result, added, held_out=False)
 
     def map_regular(
         self,
@@ -97,7 +97,7 @@ class Mapper:
         grown = ActiveSection(
             section=result.section, views=views, neighbour_ids=active.neighbour_ids, moments=result.moments
         )
-        return grown, self._record(frame, grown, result, new.count, len(chosen), held_out=held_out)
+        return grown, self._record(frame, grown, result, new.count, held_out=held_out)
 
     def seal(self, active: ActiveSection, *, neighbours: list[Section]) -> tuple[Section, int]:
         """Finish a section: a last round over all its views; afterwards its payload never changes.
@@ -108,7 +108,7 @@ class Mapper:
         count = self.settings.iterations_seal
         key = self._section_key(active.section)
         chosen = self._even_views(key, len(active.views), count)
-        result = self._optimised(active.section, neighbours, active, active.views, chosen)
+        result = self._optimised(active.section, neighbours, active, active.views, chosen, settling=True)
         section = result.section
         last = active.views[-1]
         frames = list(section.frames)
@@ -123,7 +123,10 @@ class Mapper:
         active: ActiveSection,
         views: tuple[TrainingView, ...],
         chosen: npt.NDArray[np.int64],
+        *,
+        settling: bool = False,
     ) -> Optimised:
+        """Steps on the chosen views; ``settling`` takes the learning rates down to nothing on the way."""
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
             for index in chosen:
@@ -188,7 +191,7 @@ class Mapper:
         return 2**40 + section.section_id
 
     def _record(
-        self, frame: Frame, active: ActiveSection, result: Optimised, added: int, iterations: int, *, held_out: bool
+        self, frame: Frame, active: ActiveSection, result: Optimised, added: int, *, held_out: bool
     ) -> CommitRecord:
         section = active.section
         return CommitRecord(
@@ -198,7 +201,7 @@ class Mapper:
             T_world_camera=section.T_world_frame(len(section.frames) - 1),
             gaussians_added=added,
             gaussians=section.gaussians.count,
-            iterations=iterations,
+            iterations=result.steps,
             renders=result.renders,
             loss=result.loss,
             held_out=held_out,

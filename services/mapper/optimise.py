@@ -18,11 +18,12 @@ _EPSILON = 1e-15  # of Adam in mapping, as in the released program
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Optimised:
-    """A section after some steps, the optimiser state, the last loss and the renders spent."""
+    """A section after some steps, the optimiser state, the last loss, and the steps and renders spent."""
 
     section: Section
     moments: Moments
     loss: float
+    steps: int
     renders: int
 
 
@@ -66,10 +67,12 @@ class SectionOptimiser:
         g = section.gaussians
         self._colors, self._log_radii = g.colors.copy(), g.log_radii.copy()
         self._opacity_logits = g.opacity_logits.copy()
-        self._loss, self._renders = 0.0, 0
+        self._loss, self._steps, self._renders = 0.0, 0, 0
 
-    def step(self, view: TrainingView, *, with_neighbours: bool) -> npt.NDArray[np.float64]:
+    def step(self, view: TrainingView, *, with_neighbours: bool, rate_scale: float = 1.0) -> npt.NDArray[np.float64]:
         """One step on ``view``: Eq. 2 on the section alone, and if asked on the section with its neighbours.
+
+        ``rate_scale`` is a factor on the learning rates.
 
         Returns:
             The gradient [6] of the joint loss with respect to a left twist on the section's own camera pose relative
@@ -89,9 +92,15 @@ class SectionOptimiser:
             opacity_logits = opacity_logits + weight * joint.opacity_logits[:own]
             self._loss += weight * joint_loss
             pose_gradient = _camera_twist_gradient(joined, joint, own, T_camera_section)
-        self._moments.colors.step(self._colors, colors)
-        self._moments.log_radii.step(self._log_radii, log_radii)
-        self._moments.opacity_logits.step(self._opacity_logits, opacity_logits)
+        self._steps += 1
+        s = self._settings
+        for adam, parameters, gradient, rate in (
+            (self._moments.colors, self._colors, colors, s.learning_rate_color),
+            (self._moments.log_radii, self._log_radii, log_radii, s.learning_rate_log_radius),
+            (self._moments.opacity_logits, self._opacity_logits, opacity_logits, s.learning_rate_opacity),
+        ):
+            adam.lr = rate * rate_scale
+            adam.step(parameters, gradient)
         return pose_gradient
 
     def move_anchor(self, T_world_section: npt.NDArray[np.float64]) -> None:
@@ -100,7 +109,9 @@ class SectionOptimiser:
 
     def finished(self) -> Optimised:
         """The section with the attributes reached."""
-        return Optimised(section=self._current(), moments=self._moments, loss=self._loss, renders=self._renders)
+        return Optimised(
+            section=self._current(), moments=self._moments, loss=self._loss, steps=self._steps, renders=self._renders
+        )
 
     def _splats(self) -> Splats:
         return Splats(

@@ -19,7 +19,14 @@ from vtslam.common.splat.engine import Engine
 from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section, world_points_m
 from vtslam.services.tracker.odometry import rgbd_odometry
 from vtslam.services.tracker.optimisers import PoseEstimate, PoseOptimiser, make_optimiser
-from vtslam.services.tracker.state import ExternalPose, TrackerState, TrackingQuality, TrackingState, TrackResult
+from vtslam.services.tracker.state import (
+    UNKNOWN_VARIANCE,
+    ExternalPose,
+    TrackerState,
+    TrackingQuality,
+    TrackingState,
+    TrackResult,
+)
 
 _MIN_LOSSES = 5  # frames before the usual loss is known
 
@@ -83,7 +90,7 @@ class Tracker:
                 )
                 if again is not None and again.estimate.loss.total < attempt.estimate.loss.total:
                     attempt, rescued = again, True
-        return self._result(frame, attempt, T_guess, state, is_head=is_head, rescued=rescued)
+        return self._result(frame, attempt, T_guess, state, is_head=is_head, rescued=rescued, prior=prior)
 
     def _usable(self, frame: Frame, state: TrackerState) -> npt.NDArray[np.bool_]:
         """Valid and near pixels; the frame's own mean depth counts for the far filter."""
@@ -166,7 +173,7 @@ class Tracker:
         if prior is not None:
             relative = PosePrior(
                 T_camera_map=se3.inverse(section.T_section_camera(prior.T_world_camera)),
-                information=np.asarray(np.linalg.inv(prior.covariance), np.float64),
+                information=prior.information(),
             )
         return make_optimiser(
             frame,
@@ -198,14 +205,18 @@ class Tracker:
         *,
         is_head: bool,
         rescued: bool,
+        prior: ExternalPose | None,
     ) -> TrackResult:
+        # What is left when the map says nothing: the other sensor's word, else the constant-velocity guess.
+        fallback = T_guess if prior is None else prior.T_world_camera
+        unknown = np.eye(6) * UNKNOWN_VARIANCE if prior is None else prior.covariance
         if attempt is None:  # nothing to track against
             quality = TrackingQuality(
                 color_loss=0.0, depth_loss_m=0.0, covered_share=0.0, renders=0, section_id=-1, rescued=False
             )
             return TrackResult(
-                T_world_camera=T_guess,
-                covariance=np.eye(6) * 1e6,
+                T_world_camera=fallback,
+                covariance=unknown,
                 quality=quality,
                 state=TrackingState.LOST,
                 overlap_section_id=-1,
@@ -214,9 +225,10 @@ class Tracker:
         share = estimate.loss.pixels / (frame.camera.width * frame.camera.height)
         verdict = self._state(estimate, share, state)
         T_world_camera = section.T_world_section @ se3.inverse(estimate.T_camera_section)
+        lost = verdict is TrackingState.LOST
         return TrackResult(
-            T_world_camera=T_guess if verdict is TrackingState.LOST else se3.orthonormalized(T_world_camera),
-            covariance=estimate.covariance,
+            T_world_camera=fallback if lost else se3.orthonormalized(T_world_camera),
+            covariance=unknown if lost else estimate.covariance,
             quality=TrackingQuality(
                 color_loss=estimate.loss.color,
                 depth_loss_m=estimate.loss.depth_m,

@@ -22,7 +22,7 @@ def rgbd_odometry(previous: Frame, current: Frame) -> npt.NDArray[np.float64] | 
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         depth = frame.depth_m()
         depth[depth <= 0] = np.nan
-        frames.append(cv2.OdometryFrame(gray, depth))
+        frames.append(cv2.OdometryFrame(depth, gray))
         odometry.prepareFrame(frames[-1])
     found, T_current_previous = odometry.compute(frames[0], frames[1])
     if not found or not se3.is_rigid(np.asarray(T_current_previous, np.float64)):

@@ -8,16 +8,15 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
-from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim.alignment import PosePrior, align, observed_frame, reference_view
 from vtslam.common.optim.pose_adam import PoseAdam
 from vtslam.common.optim.tracking_loss import Target, TrackingLoss, tracking_loss
 from vtslam.common.section import Section
 from vtslam.common.settings import AdamSettings, GaussNewtonSettings, TrackerSettings
 from vtslam.common.splat.engine import Engine, Rendering
+from vtslam.services.tracker.state import UNKNOWN_VARIANCE
 
 _ADAPTIVE_SILHOUETTES = (0.990, 0.993, 0.995, 0.997, 0.999)
-_UNKNOWN = 1e6  # variance of a pose nothing was measured of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,10 +89,12 @@ class _Adam:
         target = Target(rgb=self._rgb, depth_m=self._depth_m, mask=mask)
         threshold = s.silhouette_threshold
         first: TrackingLoss | None = None
-        best: tuple[TrackingLoss, npt.NDArray[np.float64]] | None = None
-        for _ in range(iterations):
+        best: tuple[float, TrackingLoss, npt.NDArray[np.float64]] | None = None
+        renders = 0
+        while renders < iterations:
             T = adam.T_camera_map
             rendering = self._engine.render(section.splats, self._camera, T)
+            renders += 1
             if first is None and s.silhouette_adaptive:
                 threshold = _adaptive_silhouette(rendering, target)
             loss, d_rgb, d_depth = tracking_loss(
@@ -104,30 +105,36 @@ class _Adam:
                 depth_weight=s.depth_weight,
             )
             first = first or loss
-            if best is None or loss.total < best[0].total:
-                best = (loss, T)
+            prior_cost, prior_gradient = self._prior_terms(T)
+            cost = loss.total + prior_cost / max(loss.pixels, 1)
+            if best is None or cost < best[0]:
+                best = (cost, loss, T)
             if loss.pixels == 0:
                 break
-            gradient = self._engine.backward(rendering, d_rgb=d_rgb, d_depth=d_depth).pose
-            if self._prior is not None:
-                error = se3.log(T @ se3.inverse(self._prior.T_camera_map))
-                gradient = gradient + self._prior.information @ error
-            adam.step(gradient)
+            adam.step(self._engine.backward(rendering, d_rgb=d_rgb, d_depth=d_depth).pose + prior_gradient)
         assert first is not None
         assert best is not None
         return PoseEstimate(
-            T_camera_section=best[1],
-            covariance=_adam_covariance(best[0], self._camera),
+            T_camera_section=best[2],
+            covariance=_adam_covariance(best[1]),
             first_loss=first,
-            loss=best[0],
-            renders=iterations,
+            loss=best[1],
+            renders=renders,
         )
 
+    def _prior_terms(self, T: npt.NDArray[np.float64]) -> tuple[float, npt.NDArray[np.float64]]:
+        """Cost and gradient of the prior at ``T``, on the scale of Eq. 1's sums."""
+        if self._prior is None:
+            return 0.0, np.zeros(6)
+        error = se3.log(T @ se3.inverse(self._prior.T_camera_map))
+        pull = self._prior.information @ error
+        return 0.5 * float(error @ pull), pull
 
-def _adam_covariance(loss: TrackingLoss, camera: Camera) -> npt.NDArray[np.float64]:
+
+def _adam_covariance(loss: TrackingLoss) -> npt.NDArray[np.float64]:
     """A rough covariance of a first-order estimate: the depth error averaged over its pixels, at 1 m lever arm."""
     if loss.pixels == 0:
-        return np.eye(6) * _UNKNOWN
+        return np.eye(6) * UNKNOWN_VARIANCE
     # Neighbouring residuals are alike: count one independent measurement per 16x16 pixels.
     independent = max(loss.pixels / 256.0, 1.0)
     return np.eye(6) * max(loss.depth_m, 1e-4) ** 2 / independent
@@ -222,5 +229,5 @@ def _covariance(information: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]
     """Inverse information; directions nothing was measured along get a large variance."""
     values, vectors = np.linalg.eigh(information)
     # Pixels are correlated over the footprint of a Gaussian and of the depth sensor's filter: 1 in 16 counts.
-    variances = np.minimum(16.0 / np.maximum(values, 1e-12), _UNKNOWN)
+    variances = np.minimum(16.0 / np.maximum(values, 1e-12), UNKNOWN_VARIANCE)
     return np.asarray((vectors * variances) @ vectors.T)
