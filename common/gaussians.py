@@ -125,6 +125,7 @@ def tied_to_frame(
     depth_factor: float,
     opacity: float,
     radius_factor: float = 1.0,
+    border_radius: float = 1.0,
     edges: npt.NDArray[np.bool_] | None = None,
 ) -> ViewTiedGaussians:
     """New Gaussians at the pixels of ``mask`` that have depth (paper, section 3.2 and Eq. 3).
@@ -136,6 +137,7 @@ def tied_to_frame(
         depth_factor: Factor on depth before placing them.
         opacity: Initial opacity, 0 to 1.
         radius_factor: Initial sigma over depth / focal length.
+        border_radius: Further factor for the outermost pixels.
         edges: bool [H,W], where four half-size Gaussians are added to the pixel's own, or None.
 
     Returns:
@@ -147,16 +149,31 @@ def tied_to_frame(
         edge_pixels = np.flatnonzero(mask & edges & (frame.depth > 0)).astype(np.int32)
         subpixel = np.concatenate([subpixel, np.tile(np.arange(1, 5, dtype=np.uint8), edge_pixels.size)])
         pixels = np.concatenate([pixels, np.repeat(edge_pixels, 4)])
-    depth = frame.depth.reshape(-1)[pixels]
-    sigma_m = depth * (frame.depth_scale_m * depth_factor * radius_factor / frame.camera.mean_focal_px)
-    log_radii = np.log(np.where(subpixel > 0, 0.5 * sigma_m, sigma_m)).astype(np.float32)
     logit = np.float32(np.log(opacity / (1.0 - opacity)))
-    return ViewTiedGaussians(
+    tied = ViewTiedGaussians(
         frame_index=np.full(pixels.size, frame_index, np.uint16),
         pixel=pixels,
         subpixel=subpixel,
-        depth=depth,
+        depth=frame.depth.reshape(-1)[pixels],
         colors=frame.rgb_float().reshape(-1, 3)[pixels],
-        log_radii=log_radii,
+        log_radii=np.zeros(pixels.size, np.float32),
         opacity_logits=np.full(pixels.size, logit, np.float32),
     )
+    unit_m = frame.depth_scale_m * depth_factor
+    radii = first_log_radii(
+        tied, frame.camera, depth_unit_m=unit_m, factor=radius_factor, border_factor=border_radius
+    )
+    return tied.with_attributes(colors=tied.colors, log_radii=radii, opacity_logits=tied.opacity_logits)
+
+
+def first_log_radii(
+    gaussians: ViewTiedGaussians, camera: Camera, *, depth_unit_m: float, factor: float, border_factor: float
+) -> npt.NDArray[np.float32]:
+    """Log radii float32 [N] before any learning: factor * depth / focal length (Eq. 3).
+
+    Halved for the edge supplement, and times ``border_factor`` at the outermost pixels of the image.
+    """
+    column, row = gaussians.pixel % camera.width, gaussians.pixel // camera.width
+    border = (column == 0) | (row == 0) | (column == camera.width - 1) | (row == camera.height - 1)
+    sigma_m = gaussians.depth * (depth_unit_m * factor / camera.mean_focal_px) * np.where(border, border_factor, 1.0)
+    return np.log(np.where(gaussians.subpixel > 0, 0.5 * sigma_m, sigma_m)).astype(np.float32)

@@ -187,6 +187,8 @@ class MapperSettings:
         learning_rate_color: Adam's rate of colours.
         learning_rate_log_radius: ... of log radii.
         learning_rate_opacity: ... of opacity logits.
+        adam_epsilon: Adam's epsilon; a larger one keeps Gaussians that hardly show where they started.
+        radius_limit: Largest factor between a radius and its first value; 0 for none.
         keep_moments: Keep Adam's moments from frame to frame of a section.
         color_weight: Weight of the colour terms, of Eq. 2.
         depth_weight: Sigma of Eq. 2.
@@ -195,11 +197,13 @@ class MapperSettings:
         depth_factor: Factor on depth when Gaussians are placed.
         initial_opacity: Opacity of a new Gaussian.
         initial_radius: Radius of a new Gaussian over depth / focal length (Eq. 3).
+        border_radius: Factor on the radius of Gaussians at the image border: nothing was seen beyond it.
         edge_supplement: Add four half-size Gaussians on edge pixels.
         edge_low: Lower Canny threshold.
         edge_high: Upper Canny threshold.
         uncovered_silhouette: Pixels with a smaller silhouette get Gaussians.
         uncovered_depth_factor: So do those whose rendered depth lies behind by this many median errors; 0 never.
+        uncovered_color_error: So do those whose mean channel difference is larger than this; 0 never.
         bundle_rotation_rate: Adam's rate of a head's rotation while it is mapped, radians; 0 keeps it.
         bundle_translation_rate: The same for its translation, metres.
     """
@@ -210,6 +214,8 @@ class MapperSettings:
     learning_rate_color: NonNegative = 0.0025
     learning_rate_log_radius: NonNegative = 0.005
     learning_rate_opacity: NonNegative = 0.05
+    adam_epsilon: Positive = 1e-15
+    radius_limit: NonNegative = 0.0
     keep_moments: bool = False
     color_weight: NonNegative = 1.0
     depth_weight: NonNegative = 1.0
@@ -218,11 +224,13 @@ class MapperSettings:
     depth_factor: Annotated[float, Range(0.9, 1.1)] = 1.0
     initial_opacity: Annotated[float, Range(0.01, 0.99)] = 0.5
     initial_radius: Annotated[float, Range(0.1, 3.0)] = 1.0
+    border_radius: Annotated[float, Range(0.1, 1.0)] = 1.0
     edge_supplement: bool = False
     edge_low: NonNegative = 50.0
     edge_high: NonNegative = 200.0
     uncovered_silhouette: Fraction = 0.5
     uncovered_depth_factor: NonNegative = 50.0
+    uncovered_color_error: NonNegative = 0.0
     bundle_rotation_rate: NonNegative = 1e-4
     bundle_translation_rate: NonNegative = 1e-4
 

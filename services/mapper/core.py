@@ -156,6 +156,7 @@ class Mapper:
             depth_factor=s.depth_factor,
             opacity=s.initial_opacity,
             radius_factor=s.initial_radius,
+            border_radius=s.border_radius,
             edges=edge_mask(frame.rgb, low=s.edge_low, high=s.edge_high) if s.edge_supplement else None,
         )
 
@@ -172,6 +173,9 @@ class Mapper:
             error = np.abs(rendering.depth_m - depth_m)
             limit = self.settings.uncovered_depth_factor * float(np.median(error[valid]))
             uncovered |= (rendering.depth_m > depth_m) & (error > limit) & valid
+        if self.settings.uncovered_color_error > 0:
+            difference = np.abs(rendering.rgb - frame.rgb_float()).mean(axis=2)
+            uncovered |= difference > self.settings.uncovered_color_error
         return np.asarray(uncovered)
 
     def _random_views(self, frame_id: int, views: int, count: int) -> npt.NDArray[np.int64]:

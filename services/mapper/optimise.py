@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.gaussians import first_log_radii
 from vtslam.common.geometry import se3
 from vtslam.common.optim.adam import Adam
 from vtslam.common.optim.mapping_loss import mapping_loss
@@ -27,9 +28,9 @@ class Optimised:
     renders: int
 
 
-def _moments_of(shape: tuple[int, ...], rate: float, previous: Adam | None) -> Adam:
+def _moments_of(shape: tuple[int, ...], rate: float, epsilon: float, previous: Adam | None) -> Adam:
     """Adam's state for one attribute: a copy of the previous state with zero rows appended, or all zero."""
-    adam = Adam(shape, lr=rate, eps=_EPSILON)
+    adam = Adam(shape, lr=rate, eps=epsilon)
     if previous is not None:
         kept = previous.m.shape[0]
         adam.m[:kept], adam.v[:kept] = previous.m, previous.v
@@ -39,13 +40,13 @@ def _moments_of(shape: tuple[int, ...], rate: float, previous: Adam | None) -> A
 
 def _new_moments(section: Section, settings: MapperSettings, previous: Moments | None) -> Moments:
     """Optimiser state for a section's Gaussians; kept rows go on where they were if the settings keep moments."""
-    g = section.gaussians
+    g, s = section.gaussians, settings
     kept = previous if settings.keep_moments else None
     return Moments(
-        colors=_moments_of(g.colors.shape, settings.learning_rate_color, kept.colors if kept else None),
-        log_radii=_moments_of(g.log_radii.shape, settings.learning_rate_log_radius, kept.log_radii if kept else None),
+        colors=_moments_of(g.colors.shape, s.learning_rate_color, s.adam_epsilon, kept and kept.colors),
+        log_radii=_moments_of(g.log_radii.shape, s.learning_rate_log_radius, s.adam_epsilon, kept and kept.log_radii),
         opacity_logits=_moments_of(
-            g.opacity_logits.shape, settings.learning_rate_opacity, kept.opacity_logits if kept else None
+            g.opacity_logits.shape, s.learning_rate_opacity, s.adam_epsilon, kept and kept.opacity_logits
         ),
     )
 
@@ -68,6 +69,15 @@ class SectionOptimiser:
         self._colors, self._log_radii = g.colors.copy(), g.log_radii.copy()
         self._opacity_logits = g.opacity_logits.copy()
         self._loss, self._steps, self._renders = 0.0, 0, 0
+        first = first_log_radii(
+            g,
+            section.camera,
+            depth_unit_m=section.depth_unit_m,
+            factor=settings.initial_radius,
+            border_factor=settings.border_radius,
+        )
+        span = np.float32(np.log(max(settings.radius_limit, 1.0)))
+        self._log_radius_bounds = (first - span, first + span)
 
     def step(self, view: TrainingView, *, with_neighbours: bool, rate_scale: float = 1.0) -> npt.NDArray[np.float64]:
         """One step on ``view``: Eq. 2 on the section alone, and if asked on the section with its neighbours.
@@ -101,6 +111,8 @@ class SectionOptimiser:
         ):
             adam.lr = rate * rate_scale
             adam.step(parameters, gradient)
+        if s.radius_limit > 0:
+            np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
         return pose_gradient
 
     def move_anchor(self, T_world_section: npt.NDArray[np.float64]) -> None:
