@@ -160,9 +160,7 @@ def tied_to_frame(
         opacity_logits=np.full(pixels.size, logit, np.float32),
     )
     unit_m = frame.depth_scale_m * depth_factor
-    radii = first_log_radii(
-        tied, frame.camera, depth_unit_m=unit_m, factor=radius_factor, border_factor=border_radius
-    )
+    radii = first_log_radii(tied, frame.camera, depth_unit_m=unit_m, factor=radius_factor, border_factor=border_radius)
     return tied.with_attributes(colors=tied.colors, log_radii=radii, opacity_logits=tied.opacity_logits)
 
 

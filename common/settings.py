@@ -76,6 +76,7 @@ class OverlapSettings:
         depth_consistency: Relative depth difference up to which a point counts as seen.
         border_share: Image border that does not count, as a share of the width.
         max_sections: Sections that are pre-tracked.
+        loss_tolerance: The earliest section wins whose loss per pixel is at most this many times the least.
         skip_previous: Leave out the previous section's views but its head's, as the authors' program does.
     """
 
@@ -85,6 +86,7 @@ class OverlapSettings:
     depth_consistency: Annotated[float, Range(0.0, 1.0, low_open=True)] = 0.01
     border_share: Annotated[float, Range(0.0, 0.4)] = 0.03125
     max_sections: PositiveCount = 3
+    loss_tolerance: Annotated[float, Range(1.0, 10.0)] = 1.0
     skip_previous: bool = False
 
 
@@ -184,6 +186,7 @@ class MapperSettings:
         iterations_head: Optimiser steps at a head.
         iterations_regular: Optimiser steps at another frame.
         iterations_seal: Steps over all frames of a section when it is finished.
+        enough_loss: Steps on a frame end early once the last few losses (Eq. 2) lie below this; 0 never.
         learning_rate_color: Adam's rate of colours.
         learning_rate_log_radius: ... of log radii.
         learning_rate_opacity: ... of opacity logits.
@@ -211,6 +214,7 @@ class MapperSettings:
     iterations_head: Count = 30
     iterations_regular: Count = 30
     iterations_seal: Count = 0
+    enough_loss: NonNegative = 0.0
     learning_rate_color: NonNegative = 0.0025
     learning_rate_log_radius: NonNegative = 0.005
     learning_rate_opacity: NonNegative = 0.05

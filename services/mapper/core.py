@@ -55,6 +55,8 @@ class Mapper:
         bundle = HeadBundle(T_world_camera, self.settings)
         if section.gaussians.count:
             for _ in range(self.settings.iterations_head):
+                if optimiser.good_enough():
+                    break
                 pose_gradient = optimiser.step(view, with_neighbours=True)
                 optimiser.move_anchor(bundle.moved(pose_gradient))
         result = optimiser.finished()
@@ -129,9 +131,12 @@ class Mapper:
         """Steps on the chosen views; ``settling`` takes the learning rates down to nothing on the way."""
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
-            for index in chosen:
+            for done, index in enumerate(chosen):
+                if optimiser.good_enough():
+                    break
+                rate_scale = 1.0 - done / len(chosen) if settling else 1.0
                 # The head alone is shared with the neighbours (docs/method.md, 3.3).
-                optimiser.step(views[index], with_neighbours=index == 0)
+                optimiser.step(views[index], with_neighbours=index == 0, rate_scale=rate_scale)
         return optimiser.finished()
 
     def _section_frame(

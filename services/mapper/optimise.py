@@ -14,7 +14,7 @@ from vtslam.common.settings import MapperSettings
 from vtslam.common.splat.engine import Engine, Gradients, Splats
 from vtslam.services.mapper.state import Moments, TrainingView
 
-_EPSILON = 1e-15  # of Adam in mapping, as in the released program
+_RECENT_STEPS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,7 +68,8 @@ class SectionOptimiser:
         g = section.gaussians
         self._colors, self._log_radii = g.colors.copy(), g.log_radii.copy()
         self._opacity_logits = g.opacity_logits.copy()
-        self._loss, self._steps, self._renders = 0.0, 0, 0
+        self._losses: list[float] = []
+        self._renders = 0
         first = first_log_radii(
             g,
             section.camera,
@@ -89,7 +90,7 @@ class SectionOptimiser:
             to its neighbours (zero without neighbours): what bundle adjustment of a head descends along.
         """
         T_camera_section = se3.inverse(self._section.frames[view.frame_index].T_section_frame)
-        gradients, self._loss = self._loss_gradients(self._splats(), view, T_camera_section, want_means=False)
+        gradients, value = self._loss_gradients(self._splats(), view, T_camera_section, want_means=False)
         colors, log_radii, opacity_logits = gradients.colors, gradients.log_radii, gradients.opacity_logits
         pose_gradient = np.zeros(6)
         weight = self._settings.neighbour_weight
@@ -100,9 +101,9 @@ class SectionOptimiser:
             colors = colors + weight * joint.colors[:own]
             log_radii = log_radii + weight * joint.log_radii[:own]
             opacity_logits = opacity_logits + weight * joint.opacity_logits[:own]
-            self._loss += weight * joint_loss
+            value += weight * joint_loss
             pose_gradient = _camera_twist_gradient(joined, joint, own, T_camera_section)
-        self._steps += 1
+        self._losses.append(value)
         s = self._settings
         for adam, parameters, gradient, rate in (
             (self._moments.colors, self._colors, colors, s.learning_rate_color),
@@ -115,6 +116,11 @@ class SectionOptimiser:
             np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
         return pose_gradient
 
+    def good_enough(self) -> bool:
+        """Whether the last few steps found a loss below ``enough_loss``: more would fit these views, not the scene."""
+        recent = self._losses[-_RECENT_STEPS:]
+        return len(recent) == _RECENT_STEPS and sum(recent) < _RECENT_STEPS * self._settings.enough_loss
+
     def move_anchor(self, T_world_section: npt.NDArray[np.float64]) -> None:
         """Bundle adjustment of a head: the section moves as a whole, its own views see no change."""
         self._section = replace(self._section, T_world_section=T_world_section)
@@ -122,7 +128,11 @@ class SectionOptimiser:
     def finished(self) -> Optimised:
         """The section with the attributes reached."""
         return Optimised(
-            section=self._current(), moments=self._moments, loss=self._loss, steps=self._steps, renders=self._renders
+            section=self._current(),
+            moments=self._moments,
+            loss=self._losses[-1] if self._losses else 0.0,
+            steps=len(self._losses),
+            renders=self._renders,
         )
 
     def _splats(self) -> Splats:

@@ -29,6 +29,7 @@ from vtslam.services.tracker.state import (
 )
 
 _MIN_LOSSES = 5  # frames before the usual loss is known
+_ANCHOR_STRIDE = 1
 
 
 class MapReader(Protocol):
@@ -104,8 +105,10 @@ class Tracker:
         if not is_head:
             own = map_reader.section(section_id)
             # A head without depth leaves its section empty: the section before it still shows the scene.
-            if own.gaussians.count or section_id == 0:
+            if section_id == 0:
                 return [own]
+            if own.gaussians.count:
+                return [own.with_surface_of(map_reader.section(section_id - 1), own_stride=1)]
             return [map_reader.section(section_id - 1)]
         views = [
             view
@@ -115,7 +118,10 @@ class Tracker:
         points = world_points_m(frame, T_guess, frame.depth > 0)
         shares = overlap_shares(points, views, self.settings.overlap)
         ids = sections_to_pretrack(shares, views, head_section_id=section_id, settings=self.settings.overlap)
-        return [map_reader.section(i) for i in ids]
+        # The previous section's surface counts beside S^o's: the head then agrees with both, where it came from and
+        # what it closes on, and sections meet without a step.
+        previous = map_reader.section(section_id - 1)
+        return [map_reader.section(i).with_surface_of(previous, own_stride=_ANCHOR_STRIDE) for i in ids]
 
     def _attempt(
         self,
@@ -140,7 +146,7 @@ class Tracker:
                 tried.append(_Attempt(section, optimiser, None, T_guess))
         if not tried:
             return None
-        chosen = min(tried, key=lambda a: a.estimate_or_none.loss.total if a.estimate_or_none else 0.0)
+        chosen = self._chosen(tried)
         if is_head and self.settings.visibility:
             mask = self._with_visibility(frame, usable, chosen)
         estimate = chosen.optimiser.solve(chosen.section, mask, chosen.T_camera_section)
@@ -154,6 +160,13 @@ class Tracker:
             renders=spent,
         )
         return _Attempt(chosen.section, chosen.optimiser, estimate, estimate.T_camera_section)
+
+    def _chosen(self, tried: "list[_Attempt]") -> "_Attempt":
+        """The earliest section whose loss per pixel comes close to the least one: early sections have drifted less."""
+        if len(tried) == 1:
+            return tried[0]
+        limit = self.settings.overlap.loss_tolerance * min(a.estimate.loss.total for a in tried)
+        return next(a for a in tried if a.estimate.loss.total <= limit)
 
     def _with_visibility(
         self, frame: Frame, usable: npt.NDArray[np.bool_], chosen: "_Attempt"
