@@ -110,7 +110,7 @@ class Mapper:
         count = self.settings.iterations_seal
         key = self._section_key(active.section)
         chosen = self._even_views(key, len(active.views), count)
-        result = self._optimised(active.section, neighbours, active, active.views, chosen, settling=True)
+        result = self._optimised(active.section, neighbours, active, active.views, chosen)
         section = result.section
         last = active.views[-1]
         frames = list(section.frames)
@@ -125,18 +125,14 @@ class Mapper:
         active: ActiveSection,
         views: tuple[TrainingView, ...],
         chosen: npt.NDArray[np.int64],
-        *,
-        settling: bool = False,
     ) -> Optimised:
-        """Steps on the chosen views; ``settling`` takes the learning rates down to nothing on the way."""
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
-            for done, index in enumerate(chosen):
+            for index in chosen:
                 if optimiser.good_enough():
                     break
-                rate_scale = 1.0 - done / len(chosen) if settling else 1.0
                 # The head alone is shared with the neighbours (docs/method.md, 3.3).
-                optimiser.step(views[index], with_neighbours=index == 0, rate_scale=rate_scale)
+                optimiser.step(views[index], with_neighbours=index == 0)
         return optimiser.finished()
 
     def _section_frame(

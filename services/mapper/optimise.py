@@ -43,10 +43,12 @@ def _new_moments(section: Section, settings: MapperSettings, previous: Moments |
     g, s = section.gaussians, settings
     kept = previous if settings.keep_moments else None
     return Moments(
-        colors=_moments_of(g.colors.shape, s.learning_rate_color, s.adam_epsilon, kept and kept.colors),
-        log_radii=_moments_of(g.log_radii.shape, s.learning_rate_log_radius, s.adam_epsilon, kept and kept.log_radii),
+        colors=_moments_of(g.colors.shape, s.learning_rate_color, s.adam_epsilon, kept.colors if kept else None),
+        log_radii=_moments_of(
+            g.log_radii.shape, s.learning_rate_log_radius, s.adam_epsilon, kept.log_radii if kept else None
+        ),
         opacity_logits=_moments_of(
-            g.opacity_logits.shape, s.learning_rate_opacity, s.adam_epsilon, kept and kept.opacity_logits
+            g.opacity_logits.shape, s.learning_rate_opacity, s.adam_epsilon, kept.opacity_logits if kept else None
         ),
     )
 
@@ -80,10 +82,8 @@ class SectionOptimiser:
         span = np.float32(np.log(max(settings.radius_limit, 1.0)))
         self._log_radius_bounds = (first - span, first + span)
 
-    def step(self, view: TrainingView, *, with_neighbours: bool, rate_scale: float = 1.0) -> npt.NDArray[np.float64]:
+    def step(self, view: TrainingView, *, with_neighbours: bool) -> npt.NDArray[np.float64]:
         """One step on ``view``: Eq. 2 on the section alone, and if asked on the section with its neighbours.
-
-        ``rate_scale`` is a factor on the learning rates.
 
         Returns:
             The gradient [6] of the joint loss with respect to a left twist on the section's own camera pose relative
@@ -104,15 +104,10 @@ class SectionOptimiser:
             value += weight * joint_loss
             pose_gradient = _camera_twist_gradient(joined, joint, own, T_camera_section)
         self._losses.append(value)
-        s = self._settings
-        for adam, parameters, gradient, rate in (
-            (self._moments.colors, self._colors, colors, s.learning_rate_color),
-            (self._moments.log_radii, self._log_radii, log_radii, s.learning_rate_log_radius),
-            (self._moments.opacity_logits, self._opacity_logits, opacity_logits, s.learning_rate_opacity),
-        ):
-            adam.lr = rate * rate_scale
-            adam.step(parameters, gradient)
-        if s.radius_limit > 0:
+        self._moments.colors.step(self._colors, colors)
+        self._moments.log_radii.step(self._log_radii, log_radii)
+        self._moments.opacity_logits.step(self._opacity_logits, opacity_logits)
+        if self._settings.radius_limit > 0:
             np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
         return pose_gradient
 

@@ -105,10 +105,8 @@ class Tracker:
         if not is_head:
             own = map_reader.section(section_id)
             # A head without depth leaves its section empty: the section before it still shows the scene.
-            if section_id == 0:
+            if own.gaussians.count or section_id == 0:
                 return [own]
-            if own.gaussians.count:
-                return [own.with_surface_of(map_reader.section(section_id - 1), own_stride=1)]
             return [map_reader.section(section_id - 1)]
         views = [
             view
@@ -118,6 +116,8 @@ class Tracker:
         points = world_points_m(frame, T_guess, frame.depth > 0)
         shares = overlap_shares(points, views, self.settings.overlap)
         ids = sections_to_pretrack(shares, views, head_section_id=section_id, settings=self.settings.overlap)
+        if not ids:
+            return []
         # The previous section's surface counts beside S^o's: the head then agrees with both, where it came from and
         # what it closes on, and sections meet without a step.
         previous = map_reader.section(section_id - 1)

@@ -82,7 +82,7 @@ def test_refusals_are_one_line_and_start_nothing(
 
 
 def test_settings_lists_effective_values(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["settings", "--family", "replica", "--set", "seed=7", "--json", "-"]) == 0
+    assert main(["settings", "--preset", "paper", "--family", "replica", "--set", "seed=7", "--json", "-"]) == 0
     captured = capsys.readouterr()
 
     values = {row["key"]: row["value"] for row in json.loads(captured.out)["settings"]}

@@ -168,7 +168,9 @@ def test_heads_are_tracked_against_earlier_sections() -> None:
 def test_later_heads_have_neighbours_and_the_first_has_none() -> None:
     captured: list[tuple[int, ...]] = []
     archive = MemoryArchive()
-    system = System(settings_of("section.length=3"), NativeEngine(threads=1), archive, threads=1)
+    system = System(
+        settings_of("section.length=3", "mapper.neighbour_weight=1"), NativeEngine(threads=1), archive, threads=1
+    )
     for index, frame in enumerate(room_frames()[:10]):
         system.process(frame)
         if index % 3 == 0:
