@@ -72,18 +72,15 @@ class Section:
             surface=np.concatenate([self.surface, self._surface_of(frame)]),
         )
 
-    def with_surface_of(self, other: "Section", *, own_stride: int) -> "Section":
-        """The section with another one's measured surface beside every ``own_stride``-th point of its own.
-
-        The same section if the other one is this one.
-        """
+    def with_surface_of(self, other: "Section") -> "Section":
+        """The section with another one's measured surface beside its own; itself if the other one is this one."""
         if other.section_id == self.section_id:
             return self
         T = se3.inverse(self.T_world_section) @ other.T_world_section
         moved = np.empty_like(other.surface)
         moved[:, :3] = other.surface[:, :3].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         moved[:, 3:] = other.surface[:, 3:].astype(np.float64) @ T[:3, :3].T
-        return replace(self, surface=np.concatenate([self.surface[::own_stride], moved]))
+        return replace(self, surface=np.concatenate([self.surface, moved]))
 
     def _means_of(self, gaussians: ViewTiedGaussians) -> npt.NDArray[np.float32]:
         poses = np.stack([f.T_section_frame for f in self.frames])

@@ -29,7 +29,6 @@ from vtslam.services.tracker.state import (
 )
 
 _MIN_LOSSES = 5  # frames before the usual loss is known
-_ANCHOR_STRIDE = 1
 
 
 class MapReader(Protocol):
@@ -121,7 +120,7 @@ class Tracker:
         # The previous section's surface counts beside S^o's: the head then agrees with both, where it came from and
         # what it closes on, and sections meet without a step.
         previous = map_reader.section(section_id - 1)
-        return [map_reader.section(i).with_surface_of(previous, own_stride=_ANCHOR_STRIDE) for i in ids]
+        return [map_reader.section(i).with_surface_of(previous) for i in ids]
 
     def _attempt(
         self,
