@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.splat.engine import Splats
@@ -127,6 +128,7 @@ def tied_to_frame(
     radius_factor: float = 1.0,
     border_radius: float = 1.0,
     edges: npt.NDArray[np.bool_] | None = None,
+    exposure: Exposure | None = None,
 ) -> ViewTiedGaussians:
     """New Gaussians at the pixels of ``mask`` that have depth (paper, section 3.2 and Eq. 3).
 
@@ -139,10 +141,13 @@ def tied_to_frame(
         radius_factor: Initial sigma over depth / focal length.
         border_radius: Further factor for the outermost pixels.
         edges: bool [H,W], where four half-size Gaussians are added to the pixel's own, or None.
+        exposure: How the frame shows the map's colours; None for the identity.
 
     Returns:
-        Colour as observed, sigma = radius_factor * depth / focal length (Eq. 3), halved for the edge supplement.
+        Colour as observed in the map's gauge, sigma = radius_factor * depth / focal length (Eq. 3), halved for the edge
+        supplement.
     """
+    rgb = (exposure or Exposure.identity()).removed(frame.rgb_float())
     pixels = np.flatnonzero(mask & (frame.depth > 0)).astype(np.int32)
     subpixel = np.zeros(pixels.size, np.uint8)
     if edges is not None:
@@ -155,7 +160,7 @@ def tied_to_frame(
         pixel=pixels,
         subpixel=subpixel,
         depth=frame.depth.reshape(-1)[pixels],
-        colors=frame.rgb_float().reshape(-1, 3)[pixels],
+        colors=rgb.reshape(-1, 3)[pixels],
         log_radii=np.zeros(pixels.size, np.float32),
         opacity_logits=np.full(pixels.size, logit, np.float32),
     )

@@ -1,10 +1,11 @@
 """A section: N consecutive frames, the Gaussians tied to them, and the views that answer overlap questions."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.exposure import Exposure
 from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
@@ -20,12 +21,14 @@ class SectionFrame:
         frame_id: Its place in the stream.
         capture_time_ns: Capture time.
         T_section_frame: float64 [4,4], camera coordinates to section coordinates.
+        exposure: How the frame shows the map's colours.
         view_depth: uint16 [H,W] if the frame answers overlap or visibility questions, else None.
     """
 
     frame_id: int
     capture_time_ns: int
     T_section_frame: npt.NDArray[np.float64]
+    exposure: Exposure = field(default_factory=Exposure.identity)
     view_depth: npt.NDArray[np.uint16] | None = None
 
 

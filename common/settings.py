@@ -197,6 +197,7 @@ class MapperSettings:
         depth_weight: Sigma of Eq. 2.
         ssim_share: Share of the structural term in the colour terms.
         neighbour_weight: Weight of the loss with the previous and overlapping sections (Eq. 2); 0 leaves it out.
+        exposure: Estimate each frame's exposure and white balance; without, all frames count as taken alike.
         depth_factor: Factor on depth when Gaussians are placed.
         initial_opacity: Opacity of a new Gaussian.
         initial_radius: Radius of a new Gaussian over depth / focal length (Eq. 3).
@@ -225,6 +226,7 @@ class MapperSettings:
     depth_weight: NonNegative = 1.0
     ssim_share: Fraction = 0.2
     neighbour_weight: NonNegative = 1.0
+    exposure: bool = False
     depth_factor: Annotated[float, Range(0.9, 1.1)] = 1.0
     initial_opacity: Annotated[float, Range(0.01, 0.99)] = 0.5
     initial_radius: Annotated[float, Range(0.1, 3.0)] = 1.0

@@ -1,5 +1,6 @@
 """A run folder opened again together with its source: sections, poses and renderings of its frames."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.config import load
+from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.section import Section
@@ -75,9 +77,16 @@ class RecordedRun:
         return self.source.frame(frame_id)
 
     def render(self, section: Section, frame_id: int) -> Rendering:
-        """``section`` as the camera of frame ``frame_id`` sees it from the frame's committed pose."""
+        """``section`` as frame ``frame_id`` would show it: from its committed pose, with its exposure."""
         T_camera_section = se3.inverse(section.T_section_camera(self.poses[frame_id]))
-        return self._engine.render(section.splats, section.camera, T_camera_section)
+        rendering = self._engine.render(section.splats, section.camera, T_camera_section)
+        return replace(rendering, rgb=self._exposure(frame_id).applied(rendering.rgb))
+
+    def _exposure(self, frame_id: int) -> Exposure:
+        row = self.rows[frame_id]
+        return Exposure(
+            gain=np.array(row["exposure_gain"], np.float32), offset=np.array(row["exposure_offset"], np.float32)
+        )
 
     def true_poses(self) -> npt.NDArray[np.float64] | None:
         """True ``T_world_camera`` [F,4,4] of the committed frames, or None."""

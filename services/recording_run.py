@@ -35,6 +35,7 @@ class FrameFacts:
         covered_share: Share of the pixels that tracking used.
         color_loss, depth_loss_m: Loss per pixel at the end of tracking.
         position_sigma_m, rotation_sigma_rad: Standard deviations (all axes together) by the tracker's covariance.
+        exposure_gain, exposure_offset: How the frame shows the map's colours, per channel.
         map_loss: Loss at the last step of mapping.
         gaussians_added: New Gaussians.
         gaussians: Gaussians of the section afterwards.
@@ -54,6 +55,8 @@ class FrameFacts:
     depth_loss_m: float
     position_sigma_m: float
     rotation_sigma_rad: float
+    exposure_gain: tuple[float, ...]
+    exposure_offset: tuple[float, ...]
     map_loss: float
     gaussians_added: int
     gaussians: int
@@ -216,6 +219,8 @@ def _facts_of(report: FrameReport, *, read_s: float, total_s: float) -> FrameFac
         depth_loss_m=0.0 if quality is None else quality.depth_loss_m,
         position_sigma_m=float(np.sqrt(variances[:3].sum())),
         rotation_sigma_rad=float(np.sqrt(variances[3:].sum())),
+        exposure_gain=tuple(commit.exposure.gain.tolist()),
+        exposure_offset=tuple(commit.exposure.offset.tolist()),
         map_loss=commit.loss,
         gaussians_added=commit.gaussians_added,
         gaussians=commit.gaussians,

@@ -148,7 +148,9 @@ class System:
         tracked_s = self._clock()
         active, commit = self._map(frame, T_world_camera, section_id, row)
         self.map.committed(active)
-        self._state = self._state.after(frame, commit.T_world_camera, tracking, mean_depth_m(frame))
+        self._state = self._state.after(
+            frame, commit.T_world_camera, tracking, mean_depth_m(frame), exposure=commit.exposure
+        )
         self._frames += 1
         sealed, renders = (section_id, self._seal()) if row == self.settings.section.length - 1 else (None, 0)
         return FrameReport(
@@ -174,7 +176,10 @@ class System:
     ) -> tuple[ActiveSection, CommitRecord]:
         if row == 0:
             neighbours = self._head_neighbours(frame, T_world_camera, section_id)
-            return self._mapper.map_head(frame, T_world_camera, section_id=section_id, neighbours=neighbours)
+            previous = self.map.section(section_id - 1) if section_id else None
+            return self._mapper.map_head(
+                frame, T_world_camera, section_id=section_id, neighbours=neighbours, previous=previous
+            )
         active = self.map.active
         assert active is not None
         return self._mapper.map_regular(

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from vtslam.common.exposure import Exposure
 from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.section import Section, SectionFrame
 from vtslam.storage.run_folder import RunFolder
@@ -23,6 +24,8 @@ def record_of(section: Section) -> SectionRecord:
         frame_ids=np.array([frame.frame_id for frame in section.frames], np.int64),
         capture_times_ns=np.array([frame.capture_time_ns for frame in section.frames], np.int64),
         T_section_frame=np.stack([frame.T_section_frame for frame in section.frames]),
+        exposure_gain=np.stack([frame.exposure.gain for frame in section.frames]),
+        exposure_offset=np.stack([frame.exposure.offset for frame in section.frames]),
         frame_index=gaussians.frame_index,
         pixel=gaussians.pixel,
         subpixel=gaussians.subpixel,
@@ -43,6 +46,7 @@ def section_of(record: SectionRecord) -> Section:
             frame_id=int(record.frame_ids[row]),
             capture_time_ns=int(record.capture_times_ns[row]),
             T_section_frame=record.T_section_frame[row],
+            exposure=Exposure(gain=record.exposure_gain[row], offset=record.exposure_offset[row]),
             view_depth=record.view_depth[row_of_view[row]] if row in row_of_view else None,
         )
         for row in range(record.num_frames)

@@ -32,6 +32,8 @@ class SectionRecord:
         frame_ids: int64 [F], places in the stream, strictly increasing; F is 1 to 65536.
         capture_times_ns: int64 [F].
         T_section_frame: float64 [F,4,4], camera to section.
+        exposure_gain: float32 [F,3], positive: a frame shows the map's colours as gain * colour + offset.
+        exposure_offset: float32 [F,3].
         frame_index: uint16 [N], the row of the frame table that a Gaussian is tied to.
         pixel: int32 [N], v * W + u.
         subpixel: uint8 [N]; 0 for the whole pixel, 1 to 4 for its quarter cells (the edge supplement).
@@ -54,6 +56,8 @@ class SectionRecord:
     frame_ids: npt.NDArray[np.int64]
     capture_times_ns: npt.NDArray[np.int64]
     T_section_frame: npt.NDArray[np.float64]
+    exposure_gain: npt.NDArray[np.float32]
+    exposure_offset: npt.NDArray[np.float32]
     frame_index: npt.NDArray[np.uint16]
     pixel: npt.NDArray[np.int32]
     subpixel: npt.NDArray[np.uint8]
@@ -69,6 +73,8 @@ class SectionRecord:
         "frame_ids": ("int64", "F"),
         "capture_times_ns": ("int64", "F"),
         "T_section_frame": ("float64", "F 4 4"),
+        "exposure_gain": ("float32", "F 3"),
+        "exposure_offset": ("float32", "F 3"),
         "frame_index": ("uint16", "N"),
         "pixel": ("int32", "N"),
         "subpixel": ("uint8", "N"),
@@ -172,6 +178,10 @@ class SectionRecord:
         for row, pose in enumerate(self.T_section_frame):
             if not _is_rigid(pose):
                 raise ValueError(f"T_section_frame: expected a rigid motion in row {row}, found {pose.tolist()}")
+        if not (np.isfinite(self.exposure_gain) & (self.exposure_gain > 0)).all():
+            raise ValueError("exposure_gain: expected positive numbers, found others")
+        if not np.isfinite(self.exposure_offset).all():
+            raise ValueError("exposure_offset: expected finite numbers, found NaN or infinity")
 
     def _check_gaussians(self) -> None:
         self._check_range("frame_index", 0, self.num_frames - 1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.exposure import Exposure, estimated_exposure
 from vtslam.common.frame import Frame
 from vtslam.common.gaussians import ViewTiedGaussians, edge_mask, tied_to_frame
 from vtslam.common.geometry import se3
@@ -17,6 +18,9 @@ from vtslam.common.splat.engine import Engine, Rendering
 from vtslam.services.mapper.bundle import HeadBundle
 from vtslam.services.mapper.optimise import Optimised, SectionOptimiser
 from vtslam.services.mapper.state import ActiveSection, CommitRecord, TrainingView
+
+# Small errors of the exposure add up from section to section; let go of this share, they stay bounded.
+_GAUGE_LEAK = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +33,13 @@ class Mapper:
     seed: int
 
     def map_head(
-        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], *, section_id: int, neighbours: list[Section]
+        self,
+        frame: Frame,
+        T_world_camera: npt.NDArray[np.float64],
+        *,
+        section_id: int,
+        neighbours: list[Section],
+        previous: Section | None = None,
     ) -> tuple[ActiveSection, CommitRecord]:
         """Open a section at its head: a Gaussian at every pixel with depth, optimised with its neighbours (Eq. 2).
 
@@ -38,19 +48,21 @@ class Mapper:
             T_world_camera: float64 [4,4], its tracked pose; bundle adjustment may move it.
             section_id: The new section.
             neighbours: The previous and the overlapping section, without repetition; empty for section 0.
+            previous: The previous section, which the head's exposure is measured by; None for section 0.
         """
+        exposure = self._head_exposure(frame, T_world_camera, previous)
         section = Section(
             section_id=section_id,
             T_world_section=T_world_camera,
             camera=frame.camera,
             depth_scale_m=frame.depth_scale_m,
             depth_factor=self.settings.depth_factor,
-            frames=(self._section_frame(frame, np.eye(4), 0, held_out=False),),
-            gaussians=self._tied(frame, frame.depth > 0, 0),
+            frames=(self._section_frame(frame, np.eye(4), 0, exposure, held_out=False),),
+            gaussians=self._tied(frame, frame.depth > 0, 0, exposure),
             means_m=np.zeros((0, 3), np.float32),
             surface=np.zeros((0, 6), np.float32),
         ).retied()
-        view = TrainingView(frame_index=0, frame=frame)
+        view = TrainingView(frame_index=0, frame=frame, exposure=exposure)
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None)
         bundle = HeadBundle(T_world_camera, self.settings)
         if section.gaussians.count:
@@ -89,11 +101,15 @@ class Mapper:
         """
         row = len(active.section.frames)
         T_section_frame = active.section.T_section_camera(T_world_camera)
-        new, views = ViewTiedGaussians.empty(), active.views
+        new, views, exposure = ViewTiedGaussians.empty(), active.views, active.section.frames[-1].exposure
         if not held_out:
-            new = self._tied(frame, self._uncovered(active.section, frame, T_section_frame), row)
-            views = (*views, TrainingView(frame_index=row, frame=frame))
-        section = active.section.grown(self._section_frame(frame, T_section_frame, row, held_out=held_out), new)
+            shown = self._shown(active.section, frame, T_section_frame)
+            if self.settings.exposure:
+                exposure = estimated_exposure(shown, frame, fallback=exposure)
+            new = self._tied(frame, self._uncovered(shown, frame, exposure), row, exposure)
+            views = (*views, TrainingView(frame_index=row, frame=frame, exposure=exposure))
+        stored = self._section_frame(frame, T_section_frame, row, exposure, held_out=held_out)
+        section = active.section.grown(stored, new)
         chosen = self._random_views(frame.frame_id, len(views), self.settings.iterations_regular)
         result = self._optimised(section, neighbours, active, views, chosen)
         grown = ActiveSection(
@@ -136,7 +152,13 @@ class Mapper:
         return optimiser.finished()
 
     def _section_frame(
-        self, frame: Frame, T_section_frame: npt.NDArray[np.float64], row: int, *, held_out: bool
+        self,
+        frame: Frame,
+        T_section_frame: npt.NDArray[np.float64],
+        row: int,
+        exposure: Exposure,
+        *,
+        held_out: bool,
     ) -> SectionFrame:
         """A row of the frame table; candidate views and the middle frame keep their depth."""
         s = self.section_settings
@@ -145,10 +167,11 @@ class Mapper:
             frame_id=frame.frame_id,
             capture_time_ns=frame.capture_time_ns,
             T_section_frame=T_section_frame,
+            exposure=exposure,
             view_depth=frame.depth if keeps_depth else None,
         )
 
-    def _tied(self, frame: Frame, mask: npt.NDArray[np.bool_], row: int) -> ViewTiedGaussians:
+    def _tied(self, frame: Frame, mask: npt.NDArray[np.bool_], row: int, exposure: Exposure) -> ViewTiedGaussians:
         s = self.settings
         return tied_to_frame(
             frame,
@@ -159,15 +182,25 @@ class Mapper:
             radius_factor=s.initial_radius,
             border_radius=s.border_radius,
             edges=edge_mask(frame.rgb, low=s.edge_low, high=s.edge_high) if s.edge_supplement else None,
+            exposure=exposure,
         )
 
-    def _uncovered(
-        self, section: Section, frame: Frame, T_section_frame: npt.NDArray[np.float64]
-    ) -> npt.NDArray[np.bool_]:
+    def _shown(self, section: Section, frame: Frame, T_section_frame: npt.NDArray[np.float64]) -> Rendering:
+        """The section as the frame's camera sees it."""
+        return self.engine.render(section.splats, frame.camera, se3.inverse(T_section_frame))
+
+    def _head_exposure(
+        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], previous: Section | None
+    ) -> Exposure:
+        """A head's exposure, in the gauge of the section before it; the world's first frame sets the gauge."""
+        if previous is None or not self.settings.exposure:
+            return Exposure.identity()
+        shown = self._shown(previous, frame, previous.T_section_camera(T_world_camera))
+        found = estimated_exposure(shown, frame, fallback=previous.frames[-1].exposure)
+        return found.nearer_to_identity(_GAUGE_LEAK)
+
+    def _uncovered(self, rendering: Rendering, frame: Frame, exposure: Exposure) -> npt.NDArray[np.bool_]:
         """Pixels where the section shows nothing, or something far behind what was measured (docs/method.md, 3.1)."""
-        if section.gaussians.count == 0:
-            return frame.depth > 0
-        rendering: Rendering = self.engine.render(section.splats, frame.camera, se3.inverse(T_section_frame))
         uncovered = rendering.alpha < self.settings.uncovered_silhouette
         depth_m, valid = frame.depth_m(), frame.depth > 0
         if self.settings.uncovered_depth_factor > 0 and valid.any():
@@ -175,7 +208,7 @@ class Mapper:
             limit = self.settings.uncovered_depth_factor * float(np.median(error[valid]))
             uncovered |= (rendering.depth_m > depth_m) & (error > limit) & valid
         if self.settings.uncovered_color_error > 0:
-            difference = np.abs(rendering.rgb - frame.rgb_float()).mean(axis=2)
+            difference = np.abs(exposure.applied(rendering.rgb) - frame.rgb_float()).mean(axis=2)
             uncovered |= difference > self.settings.uncovered_color_error
         return np.asarray(uncovered)
 
@@ -204,6 +237,7 @@ class Mapper:
             section_id=section.section_id,
             frame_index=len(section.frames) - 1,
             T_world_camera=section.T_world_frame(len(section.frames) - 1),
+            exposure=section.frames[-1].exposure,
             gaussians_added=added,
             gaussians=section.gaussians.count,
             iterations=result.steps,

@@ -150,7 +150,7 @@ class SectionOptimiser:
         rendering = self._engine.render(splats, view.frame.camera, T_camera_section)
         self._renders += 1
         loss = mapping_loss(
-            rendering.rgb,
+            view.exposure.applied(rendering.rgb),
             rendering.depth_m,
             view.frame.rgb_float(),
             view.frame.depth_m(),
@@ -158,7 +158,8 @@ class SectionOptimiser:
             weight_depth=self._settings.depth_weight,
             ssim_share=self._settings.ssim_share,
         )
-        gradients = self._engine.backward(rendering, d_rgb=loss.d_rgb, d_depth=loss.d_depth, want_means=want_means)
+        d_rgb = loss.d_rgb * view.exposure.gain
+        gradients = self._engine.backward(rendering, d_rgb=d_rgb, d_depth=loss.d_depth, want_means=want_means)
         return gradients, loss.loss
 
 

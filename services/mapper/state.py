@@ -1,10 +1,11 @@
 """What the mapper carries from frame to frame of a section, and what it commits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.optim.adam import Adam
 from vtslam.common.section import Section
@@ -12,10 +13,11 @@ from vtslam.common.section import Section
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrainingView:
-    """A frame of the active section that is rendered against: its row in the frame table, and its images."""
+    """A frame of the active section that is rendered against: row in the frame table, images, exposure."""
 
     frame_index: int
     frame: Frame
+    exposure: Exposure = field(default_factory=Exposure.identity)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,6 +55,7 @@ class CommitRecord:
         section_id: Its section.
         frame_index: Its row in the section's frame table.
         T_world_camera: float64 [4,4], its committed pose.
+        exposure: How the frame shows the map's colours.
         gaussians_added: New Gaussians tied to it.
         gaussians: Gaussians of the section afterwards.
         iterations: Optimiser steps spent.
@@ -65,6 +68,7 @@ class CommitRecord:
     section_id: int
     frame_index: int
     T_world_camera: npt.NDArray[np.float64]
+    exposure: Exposure
     gaussians_added: int
     gaussians: int
     iterations: int

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.optim.alignment import PosePrior
@@ -80,13 +81,20 @@ class Tracker:
         T_guess = state.constant_velocity_guess() if guess is None else guess
         usable = self._usable(frame, state)
         candidates = self._sections_to_try(frame, T_guess, map_reader, section_id, is_head)
-        attempt = self._attempt(frame, usable, candidates, T_guess, section_id, is_head, prior)
+        attempt = self._attempt(frame, usable, candidates, T_guess, section_id, is_head, prior, state.exposure)
         rescued = False
         if attempt is not None and self._far_off(attempt.estimate, state) and state.previous_frame is not None:
             odometry = rgbd_odometry(state.previous_frame, frame)
             if odometry is not None:
                 again = self._attempt(
-                    frame, usable, candidates, state.committed_poses[-1] @ odometry, section_id, is_head, prior
+                    frame,
+                    usable,
+                    candidates,
+                    state.committed_poses[-1] @ odometry,
+                    section_id,
+                    is_head,
+                    prior,
+                    state.exposure,
                 )
                 if again is not None and again.estimate.loss.total < attempt.estimate.loss.total:
                     attempt, rescued = again, True
@@ -131,12 +139,13 @@ class Tracker:
         section_id: int,
         is_head: bool,
         prior: ExternalPose | None,
+        exposure: Exposure,
     ) -> "_Attempt | None":
         """Pre-track every section, keep the one with the least loss per pixel, and track against it."""
         mask = usable.astype(np.uint8)
         tried = []
         for section in sections:
-            optimiser = self._optimiser(frame, section, section_id == 0, prior)
+            optimiser = self._optimiser(frame, section, section_id == 0, prior, exposure)
             T_guess = se3.inverse(section.T_section_camera(T_world_guess))
             if len(sections) > 1:
                 estimate = optimiser.pretrack(section, mask, T_guess)
@@ -179,7 +188,12 @@ class Tracker:
         return np.asarray((visible if enough else usable).astype(np.uint8))
 
     def _optimiser(
-        self, frame: Frame, section: Section, in_first_section: bool, prior: ExternalPose | None
+        self,
+        frame: Frame,
+        section: Section,
+        in_first_section: bool,
+        prior: ExternalPose | None,
+        exposure: Exposure,
     ) -> PoseOptimiser:
         relative = None
         if prior is not None:
@@ -189,6 +203,7 @@ class Tracker:
             )
         return make_optimiser(
             frame,
+            exposure.removed(frame.rgb_float()),
             self.engine,
             self.settings,
             in_first_section=in_first_section,

@@ -52,6 +52,7 @@ class PoseOptimiser(Protocol):
 
 def make_optimiser(
     frame: Frame,
+    rgb: npt.NDArray[np.float32],
     engine: Engine,
     settings: TrackerSettings,
     *,
@@ -59,20 +60,27 @@ def make_optimiser(
     prior: PosePrior | None,
     threads: int,
 ) -> PoseOptimiser:
-    """The optimiser the settings ask for, ready for one frame."""
+    """The optimiser the settings ask for, ready for one frame, whose colour in the map's gauge is ``rgb`` [H,W,3]."""
     if settings.optimizer == "adam":
-        return _Adam(frame, engine, settings.adam, in_first_section=in_first_section, prior=prior)
-    return _GaussNewton(frame, engine, settings, prior=prior, threads=threads)
+        return _Adam(frame, rgb, engine, settings.adam, in_first_section=in_first_section, prior=prior)
+    return _GaussNewton(frame, rgb, engine, settings, prior=prior, threads=threads)
 
 
 class _Adam:
     """First-order descent with the minimum of the loss kept (the pose kept is the one evaluated)."""
 
     def __init__(
-        self, frame: Frame, engine: Engine, settings: AdamSettings, *, in_first_section: bool, prior: PosePrior | None
+        self,
+        frame: Frame,
+        rgb: npt.NDArray[np.float32],
+        engine: Engine,
+        settings: AdamSettings,
+        *,
+        in_first_section: bool,
+        prior: PosePrior | None,
     ) -> None:
         self._camera, self._engine, self._settings, self._prior = frame.camera, engine, settings, prior
-        self._rgb, self._depth_m = frame.rgb_float(), frame.depth_m()
+        self._rgb, self._depth_m = rgb, frame.depth_m()
         self._iterations = settings.first_section_iterations if in_first_section else settings.iterations
 
     def pretrack(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
@@ -154,12 +162,19 @@ class _GaussNewton:
     """Render, align the frame to the rendered view until that converges, render again from there."""
 
     def __init__(
-        self, frame: Frame, engine: Engine, settings: TrackerSettings, *, prior: PosePrior | None, threads: int
+        self,
+        frame: Frame,
+        rgb: npt.NDArray[np.float32],
+        engine: Engine,
+        settings: TrackerSettings,
+        *,
+        prior: PosePrior | None,
+        threads: int,
     ) -> None:
         self._camera, self._engine, self._prior, self._threads = frame.camera, engine, prior, threads
         self._settings: GaussNewtonSettings = settings.gauss_newton
         self._weights = settings.adam
-        self._rgb, self._depth_m = frame.rgb_float(), frame.depth_m()
+        self._rgb, self._depth_m = rgb, frame.depth_m()
 
     def pretrack(self, section: Section, mask: npt.NDArray[np.uint8], T_guess: npt.NDArray[np.float64]) -> PoseEstimate:
         return self._refine(section, mask, T_guess, renders=2)

@@ -1,11 +1,12 @@
 """What the tracker carries from frame to frame, and what it says of a frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 
@@ -97,12 +98,14 @@ class TrackerState:
         previous_frame: The last frame, for odometry.
         losses: (colour, depth) losses of past frames, newest last, bounded.
         largest_mean_depths_m: The largest per-frame mean depths, descending, bounded.
+        exposure: The last frame's; the next one is taken to have the same while it is tracked.
     """
 
     committed_poses: tuple[npt.NDArray[np.float64], ...] = ()
     previous_frame: Frame | None = None
     losses: tuple[tuple[float, float], ...] = ()
     largest_mean_depths_m: tuple[float, ...] = ()
+    exposure: Exposure = field(default_factory=Exposure.identity)
 
     def constant_velocity_guess(self) -> npt.NDArray[np.float64]:
         """T_t = T_{t-1} T_{t-2}^-1 T_{t-1}; the last pose if there is only one, the identity if there is none."""
@@ -118,7 +121,13 @@ class TrackerState:
         return tuple(sorted((*self.largest_mean_depths_m, mean_depth_m), reverse=True)[:_FAR_SAMPLES])
 
     def after(
-        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], result: TrackResult | None, mean_depth_m: float
+        self,
+        frame: Frame,
+        T_world_camera: npt.NDArray[np.float64],
+        result: TrackResult | None,
+        mean_depth_m: float,
+        *,
+        exposure: Exposure | None = None,
     ) -> "TrackerState":
         """The state once ``frame`` is committed at ``T_world_camera``."""
         losses = self.losses
@@ -131,4 +140,5 @@ class TrackerState:
             largest_mean_depths_m=self.with_mean_depth(mean_depth_m)
             if mean_depth_m > 0
             else self.largest_mean_depths_m,
+            exposure=exposure or self.exposure,
         )

@@ -7,7 +7,7 @@ from helpers.sections import assert_same_section, small_section
 from vtslam.storage.section_file import read_section, verify_file, write_section
 
 GOLDEN = Path(__file__).with_name("section_v1.vts")
-SHA256 = "d1a387fa517d7115c7e8ffd7fc58f3f7c702cbba9235aa52acf87505187301db"
+SHA256 = "7ab5b3d36907d432e61b2da01d8486004d95de76d59cad80ae865901840496de"
 
 
 def test_golden_file_is_the_committed_one() -> None:

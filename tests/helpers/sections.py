@@ -25,6 +25,8 @@ def small_section(*, section_id: int = 7, num_gaussians: int = 20, num_views: in
         frame_ids=np.array([30, 31, 33], np.int64),
         capture_times_ns=np.array([1_000_000_000, 1_033_333_333, 1_100_000_000], np.int64),
         T_section_frame=poses,
+        exposure_gain=(1.0 + np.arange(3 * NUM_FRAMES).reshape(-1, 3) / 32.0).astype(np.float32),
+        exposure_offset=(np.arange(3 * NUM_FRAMES).reshape(-1, 3) / 128.0 - 0.03125).astype(np.float32),
         frame_index=(rows % NUM_FRAMES).astype(np.uint16),
         pixel=(rows * 7 % (WIDTH * HEIGHT)).astype(np.int32),
         subpixel=(rows % 5).astype(np.uint8),

@@ -21,6 +21,8 @@ def facts(frame_id: int, state: str) -> FrameFacts:
         depth_loss_m=0.0,
         position_sigma_m=0.0,
         rotation_sigma_rad=0.0,
+        exposure_gain=(1.0, 1.0, 1.0),
+        exposure_offset=(0.0, 0.0, 0.0),
         map_loss=0.0,
         gaussians_added=0,
         gaussians=0,

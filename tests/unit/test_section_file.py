@@ -318,7 +318,7 @@ def test_wrong_sha256_under_right_crcs(path: Path, parts: VtsParts) -> None:
         (lambda parts: replace(parts, index=b"\x91" * 2000 + b"\xc0"), "index: is not msgpack|nested more"),
         (lambda parts: replace(parts, index=b"\x91" * 20 + b"\xc0"), "index: .* nested more than 16 deep"),
         (lambda parts: replace(parts, index=bytes(65537)), "index: expected at most 65536 bytes that end at"),
-        (lambda parts: replace(parts, index=b"\xdc\x00\x0d" + parts.index[1:]), "index: is not in the one form"),
+        (lambda parts: replace(parts, index=b"\xdc\x00\x0f" + parts.index[1:]), "index: is not in the one form"),
         (lambda parts: replace(parts, header=b"\xc0" + parts.header[1:]), "header: is not msgpack"),
         (lambda parts: replace(parts, header_length=60000), "header length: expected at most"),
         (lambda parts: replace(parts, index_length=2**32 - 1), "index: expected at most 65536 bytes that end at"),
@@ -372,6 +372,9 @@ def _first(name: str, value: object) -> Callable[[VtsParts], VtsParts]:
         (_first("frame_ids", -1), "frame_ids: expected numbers of 0 or more that strictly increase"),
         (_first("T_world_section", 2.0), "T_world_section: expected a rigid motion"),
         (_first("T_section_frame", np.nan), "T_section_frame: expected a rigid motion in row 0"),
+        (_first("exposure_gain", 0.0), "exposure_gain: expected positive numbers"),
+        (_first("exposure_gain", np.inf), "exposure_gain: expected positive numbers"),
+        (_first("exposure_offset", np.nan), "exposure_offset: expected finite numbers"),
         (_first("T_section_frame", 1e200), "T_section_frame: expected a rigid motion in row 0"),
         (_first("frame_index", 3), "frame_index: expected 0 to 2, found 0 to 3"),
         (_first("pixel", 24), "pixel: expected 0 to 23, found 1 to 24"),
@@ -428,5 +431,13 @@ def test_records_are_checked_when_made(change: dict[str, Any], message: str) -> 
 
 def test_record_without_frames() -> None:
     none = np.zeros(0, np.int64)
+    nothing = np.zeros((0, 3), np.float32)
     with pytest.raises(ValueError, match="frame_ids: expected 1 to 65536 frames, found 0"):
-        replace(small_section(), frame_ids=none, capture_times_ns=none, T_section_frame=np.zeros((0, 4, 4)))
+        replace(
+            small_section(),
+            frame_ids=none,
+            capture_times_ns=none,
+            T_section_frame=np.zeros((0, 4, 4)),
+            exposure_gain=nothing,
+            exposure_offset=nothing,
+        )
