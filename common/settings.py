@@ -139,14 +139,14 @@ class GaussNewtonSettings:
     renders: PositiveCount = 3
     levels: Annotated[int, Range(1, 6)] = 3
     iterations: PositiveCount = 10
-    converged_m: Positive = 2e-5
-    converged_rad: Positive = 1e-5
+    converged_m: Positive = 1e-4
+    converged_rad: Positive = 5e-5
     silhouette_threshold: Fraction = 0.9
     color_sigma: Positive = 0.03
     color_weight: NonNegative = 0.05
     depth_weight: NonNegative = 1.0
-    depth_sigma_base_m: Positive = 0.002
-    depth_sigma_per_m: NonNegative = 0.0015
+    depth_sigma_base_m: Positive = 0.003
+    depth_sigma_per_m: NonNegative = 0.0003
     depth_gate_sigmas: Positive = 4.0
 
 

@@ -166,6 +166,7 @@ class _System:
 
 def _linearised(
     reference: Reference,
+    points: FloatImage,
     observed: Observed,
     level: int,
     T: npt.NDArray[np.float64],
@@ -174,14 +175,14 @@ def _linearised(
     threads: int,
 ) -> _System:
     """H, g and cost at ``T``; the prior is (T_observed_reference it asks for, information)."""
+    share = 4.0**level  # a pixel of a coarse level stands for so many pixels, and so does a point
     options = _align.AlignmentOptions(
         color_sigma=settings.color_sigma,
-        # A pixel of a coarse level stands for 4^level pixels, while all points count at each level.
-        color_weight=settings.color_weight * 4.0**level,
+        color_weight=settings.color_weight * share,
         depth_sigma_base=settings.depth_sigma_base_m,
         depth_sigma_quadratic=settings.depth_sigma_per_m,
-        depth_weight=settings.depth_weight,
-        depth_gate_sigmas=settings.depth_gate_sigmas,
+        depth_weight=settings.depth_weight * share,
+        depth_gate_sigmas=settings.depth_gate_sigmas * 2.0**level,  # the first guess may be far off
         border_px=_BORDER_PX,
     )
     view, frame = reference.levels[level], observed.levels[level]
@@ -191,7 +192,7 @@ def _linearised(
         view.mask,
         frame.packed,
         _intrinsics(view.camera),
-        reference.points,
+        points,
         observed.depth_m,
         _intrinsics(observed.camera),
         np.ascontiguousarray(T),
@@ -202,7 +203,7 @@ def _linearised(
     if prior is not None:
         error = se3.log(T @ se3.inverse(prior[0]))
         H, g, cost = H + prior[1], g + prior[1] @ error, cost + 0.5 * float(error @ prior[1] @ error)
-    measured = color_count * 4**level + depth_count
+    measured = int((color_count + depth_count) * share)
     return _System(H=H, g=g, mean_cost=cost / max(measured, 1), measured=measured)
 
 
@@ -250,16 +251,17 @@ def _solved_level(
     threads: int,
 ) -> tuple[npt.NDArray[np.float64], _System]:
     """Gauss-Newton on one level; a step that raises the mean cost is halved once, then ends the level."""
-    system = _linearised(reference, observed, level, T, settings, prior, threads)
+    points = np.ascontiguousarray(reference.points[:: 4**level])
+    system = _linearised(reference, points, observed, level, T, settings, prior, threads)
     for _ in range(settings.iterations):
         if system.measured < _MIN_MEASUREMENTS:
             break
         damped = system.H + _DAMPING * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
         step = np.asarray(-np.linalg.solve(damped, system.g), np.float64)
-        trial = _linearised(reference, observed, level, se3.exp(step) @ T, settings, prior, threads)
+        trial = _linearised(reference, points, observed, level, se3.exp(step) @ T, settings, prior, threads)
         if trial.mean_cost > system.mean_cost or trial.measured < _MIN_MEASUREMENTS:
             step = 0.5 * step
-            trial = _linearised(reference, observed, level, se3.exp(step) @ T, settings, prior, threads)
+            trial = _linearised(reference, points, observed, level, se3.exp(step) @ T, settings, prior, threads)
             if trial.mean_cost > system.mean_cost or trial.measured < _MIN_MEASUREMENTS:
                 break
         T, system = se3.exp(step) @ T, trial

@@ -125,10 +125,11 @@ class Tracker:
         ids = sections_to_pretrack(shares, views, head_section_id=section_id, settings=self.settings.overlap)
         if not ids:
             return []
-        # The previous section's surface counts beside S^o's: the head then agrees with both, where it came from and
-        # what it closes on, and sections meet without a step.
-        previous = map_reader.section(section_id - 1)
-        return [map_reader.section(i).with_surface_of(previous) for i in ids]
+        # The surfaces of all of them and of the previous section count beside S^o's own: the head then agrees with
+        # where it came from and with everything it closes on, sections meet without a step, and less hangs on which
+        # one is chosen.
+        beside = [map_reader.section(i) for i in sorted({*ids, section_id - 1})]
+        return [_with_surfaces_of(map_reader.section(i), beside) for i in ids]
 
     def _attempt(
         self,
@@ -277,6 +278,12 @@ class Tracker:
             if worst > self.settings.lost_loss_factor:
                 return TrackingState.LOST
         return TrackingState.WEAK if covered_share < self.settings.weak_covered_share else TrackingState.OK
+
+
+def _with_surfaces_of(section: Section, others: list[Section]) -> Section:
+    for other in others:
+        section = section.with_surface_of(other)
+    return section
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,9 @@ Array = npt.NDArray[np.float64]
 
 CAMERA = small_camera()
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
-SETTINGS = GaussNewtonSettings(levels=3, iterations=10, color_sigma=0.03, depth_sigma_base_m=0.002)
+SETTINGS = GaussNewtonSettings(
+    levels=3, iterations=10, color_sigma=0.03, depth_sigma_base_m=0.002, depth_sigma_per_m=0.0015
+)
 START = se3.exp(np.array([0.2, -0.1, 0.3, 0.1, 0.4, -0.2]))
 
 
@@ -195,8 +197,8 @@ def test_colour_pixels_outside_the_mask_do_not_count() -> None:
     parts = [equations(with_mask(reference, mask), observed, T, depth_weight=0.0) for mask in masks]
     assert all(part.color_count > 500 for part in parts)
     assert sum(part.color_count for part in parts) == everything.color_count
-    np.testing.assert_allclose(parts[0].H + parts[1].H, everything.H, rtol=1e-12)
-    np.testing.assert_allclose(parts[0].g + parts[1].g, everything.g, rtol=1e-9)
+    np.testing.assert_allclose(parts[0].H + parts[1].H, everything.H, rtol=1e-6)
+    np.testing.assert_allclose(parts[0].g + parts[1].g, everything.g, rtol=1e-5)
 
 
 def test_points_add_up() -> None:
@@ -208,8 +210,8 @@ def test_points_add_up() -> None:
     parts = [equations(replace(reference, points=half), observed, T, color_weight=0.0) for half in halves]
     assert all(part.depth_count > 500 for part in parts)
     assert sum(part.depth_count for part in parts) == everything.depth_count
-    np.testing.assert_allclose(parts[0].H + parts[1].H, everything.H, rtol=1e-12)
-    np.testing.assert_allclose(parts[0].g + parts[1].g, everything.g, rtol=1e-9)
+    np.testing.assert_allclose(parts[0].H + parts[1].H, everything.H, rtol=1e-6)
+    np.testing.assert_allclose(parts[0].g + parts[1].g, everything.g, rtol=1e-5)
 
 
 def test_pixels_of_the_frame_without_depth_do_not_count() -> None:
@@ -226,7 +228,7 @@ def test_pixels_of_the_frame_without_depth_do_not_count() -> None:
     )
     assert (found.color_count, found.depth_count) == (expected.color_count, expected.depth_count)
     assert found.color_count > 500
-    np.testing.assert_allclose(found.H, expected.H, rtol=1e-9)
+    np.testing.assert_allclose(found.H, expected.H, rtol=1e-5)
 
 
 def test_a_surface_that_only_the_frame_sees_is_gated() -> None:
