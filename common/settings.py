@@ -145,8 +145,8 @@ class GaussNewtonSettings:
     color_sigma: Positive = 0.03
     color_weight: NonNegative = 0.05
     depth_weight: NonNegative = 1.0
-    depth_sigma_base_m: Positive = 0.003
-    depth_sigma_per_m: NonNegative = 0.0003
+    depth_sigma_base_m: Positive = 0.002
+    depth_sigma_per_m: NonNegative = 0.0015
     depth_gate_sigmas: Positive = 4.0
 
 

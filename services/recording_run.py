@@ -17,7 +17,7 @@ from vtslam.services.system import FrameReport, System
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
 
-FIRST_FRAME_STATE = "first"  # defines the world, is not tracked
+FIRST_FRAME_STATE, KNOWN_STATE = "first", "known"  # not tracked: defines the world; came with its pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +29,7 @@ class FrameFacts:
         section_id: Section of the frame.
         is_head: Whether it opens its section.
         held_out: Whether it was kept out of mapping.
-        state: "first", "ok", "weak" or "lost".
+        state: "first", "known", "ok", "weak" or "lost".
         tracked_section_id: The section it was tracked against; -1 if none.
         rescued: Whether odometry replaced the guess.
         covered_share: Share of the pixels that tracking used.
@@ -98,6 +98,7 @@ def run_recording(
     engine: Engine,
     run: RunFolder,
     *,
+    known_poses: npt.NDArray[np.float64] | None = None,
     on_frame: Callable[[FrameFacts], None] = lambda facts: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
@@ -108,6 +109,7 @@ def run_recording(
         settings: The effective settings.
         engine: The rasteriser they ask for (`vtslam.services.engines.make_engine`).
         run: An empty run folder, open for writing.
+        known_poses: ``T_world_camera`` float64 [F,4,4] of all frames, to map at them without tracking.
         on_frame: Called after each frame.
         should_stop: Asked before each frame; True ends the run, and what was done is kept.
 
@@ -122,7 +124,8 @@ def run_recording(
             interrupted = should_stop()
             if interrupted:
                 break
-            on_frame(recorder.frame(source, index))
+            known = None if known_poses is None else known_poses[index]
+            on_frame(recorder.frame(source, index, known))
     except SourceError:
         recorder.close(finished=False, interrupted=False)
         raise
@@ -142,12 +145,12 @@ class _Recorder:
         self._times_ns: list[int] = []
         self._poses: list[npt.NDArray[np.float64]] = []
 
-    def frame(self, source: Source, index: int) -> FrameFacts:
+    def frame(self, source: Source, index: int, known_T_world_camera: npt.NDArray[np.float64] | None) -> FrameFacts:
         """Read and process one frame."""
         start_s = time.perf_counter()
         frame = source.frame(index)
         read_s = time.perf_counter() - start_s
-        report = self._system.process(frame)
+        report = self._system.process(frame, known_T_world_camera=known_T_world_camera)
         self._times_ns.append(frame.capture_time_ns)
         self._poses.append(report.commit.T_world_camera)
         facts = _facts_of(report, read_s=read_s, total_s=time.perf_counter() - start_s)
@@ -202,6 +205,12 @@ class _Recorder:
         )
 
 
+def _state(report: FrameReport) -> str:
+    if report.tracking is not None:
+        return report.tracking.state.value
+    return FIRST_FRAME_STATE if report.commit.frame_id == 0 else KNOWN_STATE
+
+
 def _facts_of(report: FrameReport, *, read_s: float, total_s: float) -> FrameFacts:
     tracking, commit = report.tracking, report.commit
     quality = None if tracking is None else tracking.quality
@@ -211,7 +220,7 @@ def _facts_of(report: FrameReport, *, read_s: float, total_s: float) -> FrameFac
         section_id=commit.section_id,
         is_head=commit.frame_index == 0,
         held_out=commit.held_out,
-        state=FIRST_FRAME_STATE if tracking is None else tracking.state.value,
+        state=_state(report),
         tracked_section_id=-1 if quality is None else quality.section_id,
         rescued=quality is not None and quality.rescued,
         covered_share=0.0 if quality is None else quality.covered_share,

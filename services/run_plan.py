@@ -4,6 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from vtslam.common.config import to_dict
 from vtslam.common.preset_loading import load_settings
 from vtslam.common.settings import Settings, SourceSettings
@@ -42,6 +45,7 @@ class RunPlan:
         *,
         overwrite: bool = False,
         created_by: str | None = None,
+        known_poses: npt.NDArray[np.float64] | None = None,
         on_frame: Callable[[FrameFacts], None] = lambda facts: None,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> RunSummary:
@@ -51,6 +55,7 @@ class RunPlan:
             folder: Where the run folder is made.
             overwrite: Give up an earlier run there.
             created_by: Program and version for ``run.toml``; this program if None.
+            known_poses: ``T_world_camera`` float64 [F,4,4] of all frames, to map at them without tracking.
             on_frame: Called after each frame.
             should_stop: Asked before each frame.
 
@@ -60,7 +65,13 @@ class RunPlan:
         """
         with RunFolder.create(folder, self._info(created_by), overwrite=overwrite) as run:
             return run_recording(
-                self.source, self.settings, self.engine, run, on_frame=on_frame, should_stop=should_stop
+                self.source,
+                self.settings,
+                self.engine,
+                run,
+                known_poses=known_poses,
+                on_frame=on_frame,
+                should_stop=should_stop,
             )
 
     def _info(self, created_by: str | None) -> RunInfo:

@@ -136,15 +136,30 @@ class System:
         self._state = TrackerState()
         self._frames = 0
 
-    def process(self, frame: Frame, *, prior: ExternalPose | None = None) -> FrameReport:
-        """Track and map the next frame; seals its section if it is the last of it."""
+    def process(
+        self,
+        frame: Frame,
+        *,
+        prior: ExternalPose | None = None,
+        known_T_world_camera: npt.NDArray[np.float64] | None = None,
+    ) -> FrameReport:
+        """Track and map the next frame; seals its section if it is the last of it.
+
+        Args:
+            frame: The frame.
+            prior: A pose from elsewhere that tracking weighs by its covariance.
+            known_T_world_camera: float64 [4,4], its pose if that is known: it is mapped there, not tracked.
+        """
         section_id, row = divmod(self._frames, self.settings.section.length)
         tracking, start_s = None, self._clock()
-        if self._frames > 0:
+        if self._frames > 0 and known_T_world_camera is None:
             tracking = self._tracker.track(
                 frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=prior
             )
-        T_world_camera = self._first_pose(prior) if tracking is None else tracking.T_world_camera
+        if known_T_world_camera is not None:
+            T_world_camera = known_T_world_camera
+        else:
+            T_world_camera = self._first_pose(prior) if tracking is None else tracking.T_world_camera
         tracked_s = self._clock()
         active, commit = self._map(frame, T_world_camera, section_id, row)
         self.map.committed(active)

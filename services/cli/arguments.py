@@ -19,6 +19,7 @@ def parser() -> argparse.ArgumentParser:
     _add_demo(commands)
     _add_run(commands)
     _add_eval(commands)
+    _add_bench(commands)
     _add_settings(commands)
     _add_doctor(commands)
     return top
@@ -63,11 +64,7 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_layers(command)
-    command.add_argument("--size", metavar="WxH", help="scale frames to this size (source.size)")
-    command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only (source.frames)")
-    command.add_argument(
-        "--holdout", type=int, metavar="K", help="track every K-th regular frame but keep it out of mapping (holdout)"
-    )
+    _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 
@@ -77,6 +74,31 @@ def _add_eval(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("run", type=Path, metavar="RUN", help="a run folder")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "bench",
+        "measure rendering, tracking, mapping or the whole system on this machine",
+        example="vtslam bench splat --size 640x480 --threads 2 --json FILE",
+    )
+    kinds = command.add_subparsers(dest="bench", metavar="WHAT", required=True)
+    splat = kinds.add_parser("splat", help="one rendering, its gradients and the loss, on a fixed scene")
+    splat.add_argument("--scene", choices=["yardstick"], default="yardstick", help="the scene (default: %(default)s)")
+    splat.add_argument("--size", default="640x480", metavar="WxH", help="image (default: %(default)s)")
+    splat.add_argument("--threads", type=int, default=2, metavar="N", help="threads (default: %(default)s)")
+    splat.add_argument("--repeats", type=int, default=15, metavar="N", help="measurements (default: %(default)s)")
+    track = kinds.add_parser("track", help="tracking on a recording, beside OpenCV's RGB-D odometry")
+    mapping = kinds.add_parser("map", help="mapping alone, at the recording's true poses")
+    system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
+    for kind in (track, mapping, system):
+        kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+        _add_layers(kind)
+        _add_source_shorthands(kind)
+    for kind in (splat, track, mapping, system):
+        kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+        kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 
 
 def _add_settings(commands: "_Commands[argparse.ArgumentParser]") -> None:
@@ -94,6 +116,14 @@ def _add_doctor(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command = _command(commands, "doctor", "check the installation and this machine", example="vtslam doctor")
     command.add_argument("--gpu", action="store_true", help="check the CUDA engine against the reference instead")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_source_shorthands(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--size", metavar="WxH", help="scale frames to this size (source.size)")
+    command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only (source.frames)")
+    command.add_argument(
+        "--holdout", type=int, metavar="K", help="track every K-th regular frame but keep it out of mapping (holdout)"
+    )
 
 
 def _add_layers(command: argparse.ArgumentParser) -> None:

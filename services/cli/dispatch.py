@@ -37,6 +37,10 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.eval_command import eval_command
 
             return eval_command(args)
+        case "bench":
+            from vtslam.services.cli.bench_command import bench_command
+
+            return bench_command(args)
         case "settings":
             from vtslam.services.cli.settings_command import settings_command
 

@@ -19,7 +19,7 @@ def run_command(args: Namespace) -> int:
         raise ConfigError("run: add --in-process; running as separate processes is not available")
     console = Console(args.json)
     plan = plan_run(
-        args.source, preset=args.preset, family=args.family, config=args.config, assignments=_assignments(args)
+        args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
     )
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
@@ -53,7 +53,7 @@ def summary_text(summary: RunSummary) -> str:
     return "\n".join(lines)
 
 
-def _assignments(args: Namespace) -> list[str]:
+def assignments_of(args: Namespace) -> list[str]:
     """``--set`` texts, and those that the short options stand for."""
     shorthands = {"source.size": args.size, "source.frames": args.frames, "holdout": args.holdout}
     given = {key: value for key, value in shorthands.items() if value is not None}

@@ -1,0 +1,56 @@
+"""``vtslam bench``: what rendering, tracking, mapping or the whole system costs here."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+from vtslam.common.config import ConfigError
+from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
+from vtslam.services.bench.recording import bench_map, bench_system, bench_track
+from vtslam.services.bench.splat import bench_splat
+from vtslam.services.cli.console import Console, Progress
+from vtslam.services.cli.run_command import assignments_of
+from vtslam.services.run_plan import plan_run
+
+_LARGEST_SIDE_PX = 16384
+_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system}
+
+
+def bench_command(args: Namespace) -> int:
+    """Measure as the arguments say; the exit status."""
+    console = Console(args.json)
+    earlier = None if args.compare is None else read_result(Path(args.compare))
+    if earlier is not None and earlier["bench"] != args.bench:
+        raise ConfigError(
+            f"--compare {args.compare}: expected a result of bench {args.bench}, found {earlier['bench']}"
+        )
+    values = _splat(args) if args.bench == "splat" else _recording(args)
+    console.print(comparison_table(values, None if earlier is None else earlier["figures"]))
+    about = surroundings(["vtslam", *sys.argv[1:]])
+    console.result({"bench": args.bench, **values, "figures": values, "about": about})
+    return 0
+
+
+def _splat(args: Namespace) -> dict[str, object]:
+    if args.threads < 1 or args.repeats < 1:
+        raise ConfigError(
+            f"bench splat: expected --threads and --repeats of at least 1, found {args.threads}, {args.repeats}"
+        )
+    with Progress(args.repeats, what="measuring", unit="repeat") as progress:
+        return bench_splat(_size(args.size), threads=args.threads, repeats=args.repeats, on_step=progress.step)
+
+
+def _recording(args: Namespace) -> dict[str, object]:
+    plan = plan_run(
+        args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
+    )
+    return _OF_RECORDINGS[args.bench](plan)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, x, height = text.partition("x")
+    if x and width.isdecimal() and height.isdecimal():
+        size = int(width), int(height)
+        if all(1 <= side <= _LARGEST_SIDE_PX for side in size):
+            return size
+    raise ConfigError(f"--size: expected WIDTHxHEIGHT of 1 to {_LARGEST_SIDE_PX} pixels, found {text!r}")
