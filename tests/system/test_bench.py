@@ -1,0 +1,101 @@
+"""``vtslam bench`` as a user runs it: figures on standard output and as JSON, set beside an earlier result."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vtslam.services.bench.comparison import comparison_table, flat
+from vtslam.services.bench.splat import yardstick_scene
+from vtslam.services.cli.__main__ import main
+
+SMALL = ["sim:room?frames=5", "--size", "64x48", "--set", "section.length=3"]
+
+
+def bench(*arguments: str, result: Path) -> dict[str, Any]:
+    assert main(["bench", *arguments, "--json", str(result)]) == 0
+    values: dict[str, Any] = json.loads(result.read_text())
+    return values
+
+
+def test_the_yardstick_scene_has_a_gaussian_of_one_pixel_at_each_pixel() -> None:
+    splats, camera = yardstick_scene(64, 48)
+    assert splats.count == 64 * 48
+    assert camera.fx == camera.fy == pytest.approx(0.9 * 64)
+    z = splats.means_m[:, 2]
+    np.testing.assert_allclose(np.exp(splats.log_radii) * camera.fx / z, 1.0, rtol=1e-5)
+    pixels = splats.means_m[:, :2] / z[:, None] * camera.fx + [camera.cx, camera.cy]
+    np.testing.assert_allclose(pixels.reshape(48, 64, 2)[7, 11], [11.5, 7.5], atol=1e-4)
+    assert not splats.opacity_logits.any()
+
+
+def test_splat_reports_times_and_where_they_were_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = tmp_path / "first.json"
+    values = bench("splat", "--size", "96x64", "--threads", "1", "--repeats", "3", result=first)
+    assert 0 < values["forward_ms"] < values["forward_backward_ms"]
+    assert values["loss_ms"] > 0
+    assert (values["gaussians"], values["threads"], values["repeats"]) == (96 * 64, 1, 3)
+    assert values["simd"] in ("avx512", "avx2", "portable")
+    assert set(values["about"]) == {"command", "processor", "commit", "versions"}
+    capsys.readouterr()
+    bench("splat", "--size", "96x64", "--repeats", "1", "--compare", str(first), result=tmp_path / "second.json")
+    table = capsys.readouterr().out
+    assert "before" in table
+    assert "forward_backward_ms" in table
+
+
+def test_track_stands_beside_opencv_on_the_same_frames(tmp_path: Path) -> None:
+    values = bench("track", *SMALL, result=tmp_path / "track.json")
+    assert values["ate_rmse_m"] < 0.02
+    assert values["opencv_ms"] > 0
+    assert values["times_opencv"] == pytest.approx(values["track_ms"] / values["opencv_ms"], abs=1e-3)
+    assert values["lost"] == 0
+
+
+def test_map_is_done_at_the_true_poses(tmp_path: Path) -> None:
+    values = bench("map", *SMALL, result=tmp_path / "map.json")
+    assert values["renders_per_frame"]["track"] == 0
+    assert values["renders_per_frame"]["map"] > 0
+    assert values["psnr_full_db"] > 20
+
+
+def test_system_tells_where_the_time_goes(tmp_path: Path) -> None:
+    values = bench("system", *SMALL, result=tmp_path / "system.json")
+    stages = values["stages_ms"]
+    parts = sum(stages[name] for name in ("read", "track", "map", "other"))
+    assert parts == pytest.approx(stages["total"], abs=0.01)
+    assert values["frames"] == 5
+    assert values["sections"] == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["splat", "--size", "640"], "--size: expected WIDTHxHEIGHT"),
+        (["splat", "--size", "0x10"], "--size: expected WIDTHxHEIGHT"),
+        (["splat", "--repeats", "0"], "expected --threads and --repeats of at least 1"),
+        (["splat", "--compare", "nowhere.json"], "--compare nowhere.json: cannot read"),
+    ],
+)
+def test_bad_arguments_are_told(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_results_of_another_benchmark_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({"bench": "map", "figures": {}}))
+    assert main(["bench", "splat", "--compare", str(other)]) == 2
+    assert "expected a result of bench splat, found map" in capsys.readouterr().err
+    other.write_text("[]")
+    assert main(["bench", "splat", "--compare", str(other)]) == 2
+    assert "expected a result of vtslam bench" in capsys.readouterr().err
+
+
+def test_a_ratio_stands_only_between_numbers() -> None:
+    table = comparison_table({"a": 2.0, "b": {"c": None, "d": "x"}}, {"a": 4.0, "b": {"c": 1.0}})
+    rows = {line.split()[0]: line.split()[1:] for line in table.splitlines()[1:]}
+    assert rows == {"a": ["2", "4", "0.500"], "b.c": ["-", "1"], "b.d": ["x", "-"]}
+    assert flat({"b": {"c": {"d": 1}}}) == {"b.c.d": 1}
