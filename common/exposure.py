@@ -49,6 +49,10 @@ class Exposure:
         """Map colours float32 [...,3] as the frame shows them."""
         return colors if self.is_identity else colors * self.gain + self.offset
 
+    def pulled_back(self, d_shown: _Image) -> _Image:
+        """Derivative by map colours, given the one by the colours as the frame shows them."""
+        return d_shown if self.is_identity else d_shown * self.gain
+
     def removed(self, colors: _Image) -> _Image:
         """A frame's colours float32 [...,3] in the map's gauge."""
         return colors if self.is_identity else (colors - self.offset) / self.gain

@@ -2,6 +2,7 @@
 
 import json
 import platform
+import statistics
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,11 @@ from vtslam.common.config import ConfigError
 from vtslam.services.process_facts import versions
 
 _CPU_INFO = Path("/proc/cpuinfo")
+
+
+def median_ms(seconds: list[float]) -> float:
+    """The median in milliseconds."""
+    return round(1e3 * statistics.median(seconds), 3)
 
 
 def surroundings(command: list[str]) -> dict[str, object]:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from vtslam.common.config import ConfigError
 from vtslam.common.metrics_trajectory import trajectory_errors
+from vtslam.services.bench.comparison import median_ms
 from vtslam.services.evaluation import evaluate_run
 from vtslam.services.recorded_run import RecordedRun
 from vtslam.services.run_plan import RunPlan
@@ -33,15 +34,17 @@ def bench_track(plan: RunPlan) -> dict[str, object]:
     """Tracking within a whole run, beside OpenCV's RGB-D odometry on the same frames in the same process."""
     values, rows = _measured(plan, known_poses=None)
     tracked_s = [row["track_s"] for row in rows[1:]]
-    odometry = _opencv_odometry(plan.source)
+    track_ms = median_ms(tracked_s)
+    opencv_ms, opencv_ate_m = _opencv_odometry(plan.source)
     return {
         "ate_rmse_m": values["ate_rmse_m"],
-        "track_ms": _median_ms(tracked_s),
+        "track_ms": track_ms,
         "track_p95_ms": round(1e3 * float(np.percentile(tracked_s, 95)), 3),
         "renders_per_frame": values["renders_per_frame"],
         "lost": sum(row["state"] == "lost" for row in rows),
-        **odometry,
-        "times_opencv": round(_median_ms(tracked_s) / float(str(odometry["opencv_ms"])), 3),
+        "opencv_ms": opencv_ms,
+        "opencv_ate_rmse_m": opencv_ate_m,
+        "times_opencv": round(track_ms / opencv_ms, 3),
     }
 
 
@@ -77,8 +80,8 @@ def _stages(rows: list[dict[str, Any]]) -> dict[str, object]:
     return {"stages_ms": {**means, "other": round(total - sum(means.values()), 3), "total": total}}
 
 
-def _opencv_odometry(source: Source) -> dict[str, object]:
-    """Time per frame of frame-to-frame odometry, and the error of the path it adds up to."""
+def _opencv_odometry(source: Source) -> tuple[float, float | None]:
+    """Milliseconds per frame of frame-to-frame odometry, and the error (m) of the path it adds up to."""
     poses, seconds = [np.eye(4)], []
     previous = source.frame(0)
     for index in range(1, len(source)):
@@ -90,11 +93,7 @@ def _opencv_odometry(source: Source) -> dict[str, object]:
         previous = frame
     truth = source.ground_truth()
     ate_m = None if truth is None else trajectory_errors(np.stack(poses), truth).ate_rmse_m
-    return {"opencv_ms": _median_ms(seconds), "opencv_ate_rmse_m": ate_m}
-
-
-def _median_ms(seconds: list[float]) -> float:
-    return round(1e3 * statistics.median(seconds), 3)
+    return median_ms(seconds), ate_m
 
 
 def _mean_ms(seconds: list[float]) -> float:

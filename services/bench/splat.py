@@ -1,6 +1,5 @@
 """How long rendering takes: one Gaussian per pixel of a smooth depth map, as a head frame of a section has."""
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,8 +11,8 @@ from vtslam.common.optim.mapping_loss import mapping_loss
 from vtslam.common.splat import _native
 from vtslam.common.splat.engine import RasterSettings, Splats
 from vtslam.common.splat.native_engine import NativeEngine
+from vtslam.services.bench.comparison import median_ms
 
-SCENES = ("yardstick",)
 _LOW_PASS_PX2, _NEAR_M = 0.3, 0.01
 _COTANGENT = 0.001
 _STEP_M = (0.02, 0.01, 0.05)  # the camera moves by this after the Gaussians were placed
@@ -92,9 +91,9 @@ def bench_splat(size: tuple[int, int], *, threads: int, repeats: int, on_step: C
         loss.append(time.perf_counter() - pulled_back_s)
         on_step()
     times = SplatTimes(
-        forward_ms=_median_ms(forward),
-        forward_backward_ms=_median_ms(both),
-        loss_ms=_median_ms(loss),
+        forward_ms=median_ms(forward),
+        forward_backward_ms=median_ms(both),
+        loss_ms=median_ms(loss),
         gaussians=splats.count,
         simd=_native.simd(),
         threads=threads,
@@ -103,7 +102,3 @@ def bench_splat(size: tuple[int, int], *, threads: int, repeats: int, on_step: C
         repeats=repeats,
     )
     return asdict(times)
-
-
-def _median_ms(seconds: list[float]) -> float:
-    return round(1e3 * statistics.median(seconds), 3)

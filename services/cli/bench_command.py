@@ -25,9 +25,9 @@ def bench_command(args: Namespace) -> int:
             f"--compare {args.compare}: expected a result of bench {args.bench}, found {earlier['bench']}"
         )
     values = _splat(args) if args.bench == "splat" else _recording(args)
-    console.print(comparison_table(values, None if earlier is None else earlier["figures"]))
+    console.print(comparison_table(values, earlier))
     about = surroundings(["vtslam", *sys.argv[1:]])
-    console.result({"bench": args.bench, **values, "figures": values, "about": about})
+    console.result({"bench": args.bench, **values, "about": about})
     return 0
 
 

@@ -106,7 +106,9 @@ class Mapper:
             shown = self._shown(active.section, frame, T_section_frame)
             if self.settings.exposure:
                 exposure = estimated_exposure(shown, frame, fallback=exposure)
-            new = self._tied(frame, self._uncovered(shown, frame, exposure), row, exposure)
+            empty = active.section.gaussians.count == 0
+            wanted = frame.depth > 0 if empty else self._uncovered(shown, frame, exposure)
+            new = self._tied(frame, wanted, row, exposure)
             views = (*views, TrainingView(frame_index=row, frame=frame, exposure=exposure))
         stored = self._section_frame(frame, T_section_frame, row, exposure, held_out=held_out)
         section = active.section.grown(stored, new)

@@ -158,7 +158,7 @@ class SectionOptimiser:
             weight_depth=self._settings.depth_weight,
             ssim_share=self._settings.ssim_share,
         )
-        d_rgb = loss.d_rgb * view.exposure.gain
+        d_rgb = view.exposure.pulled_back(loss.d_rgb)
         gradients = self._engine.backward(rendering, d_rgb=d_rgb, d_depth=loss.d_depth, want_means=want_means)
         return gradients, loss.loss
 

@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.optim.alignment import PosePrior
@@ -79,9 +78,9 @@ class Tracker:
             frame that cannot be tracked keeps its guess and is called lost.
         """
         T_guess = state.constant_velocity_guess() if guess is None else guess
-        usable = self._usable(frame, state)
+        usable, rgb = self._usable(frame, state), state.exposure.removed(frame.rgb_float())
         candidates = self._sections_to_try(frame, T_guess, map_reader, section_id, is_head)
-        attempt = self._attempt(frame, usable, candidates, T_guess, section_id, is_head, prior, state.exposure)
+        attempt = self._attempt(frame, usable, candidates, T_guess, section_id, is_head, prior, rgb)
         rescued = False
         if attempt is not None and self._far_off(attempt.estimate, state) and state.previous_frame is not None:
             odometry = rgbd_odometry(state.previous_frame, frame)
@@ -94,7 +93,7 @@ class Tracker:
                     section_id,
                     is_head,
                     prior,
-                    state.exposure,
+                    rgb,
                 )
                 if again is not None and again.estimate.loss.total < attempt.estimate.loss.total:
                     attempt, rescued = again, True
@@ -140,13 +139,13 @@ class Tracker:
         section_id: int,
         is_head: bool,
         prior: ExternalPose | None,
-        exposure: Exposure,
+        rgb: npt.NDArray[np.float32],
     ) -> "_Attempt | None":
         """Pre-track every section, keep the one with the least loss per pixel, and track against it."""
         mask = usable.astype(np.uint8)
         tried = []
         for section in sections:
-            optimiser = self._optimiser(frame, section, section_id == 0, prior, exposure)
+            optimiser = self._optimiser(frame, section, section_id == 0, prior, rgb)
             T_guess = se3.inverse(section.T_section_camera(T_world_guess))
             if len(sections) > 1:
                 estimate = optimiser.pretrack(section, mask, T_guess)
@@ -194,7 +193,7 @@ class Tracker:
         section: Section,
         in_first_section: bool,
         prior: ExternalPose | None,
-        exposure: Exposure,
+        rgb: npt.NDArray[np.float32],
     ) -> PoseOptimiser:
         relative = None
         if prior is not None:
@@ -204,7 +203,7 @@ class Tracker:
             )
         return make_optimiser(
             frame,
-            exposure.removed(frame.rgb_float()),
+            rgb,
             self.engine,
             self.settings,
             in_first_section=in_first_section,
