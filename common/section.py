@@ -75,6 +75,10 @@ class Section:
             surface=np.concatenate([self.surface, self._surface_of(frame)]),
         )
 
+    def selected(self, rows: npt.NDArray[np.bool_]) -> "Section":
+        """The section with those of its Gaussians where ``rows``, bool [N], is set."""
+        return replace(self, gaussians=self.gaussians.selected(rows), means_m=self.means_m[rows])
+
     def with_surface_of(self, other: "Section") -> "Section":
         """The section with another one's measured surface beside its own; itself if the other one is this one."""
         if other.section_id == self.section_id:

@@ -186,6 +186,8 @@ class MapperSettings:
         iterations_head: Optimiser steps at a head.
         iterations_regular: Optimiser steps at another frame.
         iterations_seal: Steps over all frames of a section when it is finished.
+        seal_rate_first: Factor on the learning rates at the first of those ...
+        seal_rate_last: ... and at the last, geometric in between.
         enough_loss: Steps on a frame end early once the last few losses (Eq. 2) lie below this; 0 never.
         learning_rate_color: Adam's rate of colours.
         learning_rate_log_radius: ... of log radii.
@@ -205,6 +207,7 @@ class MapperSettings:
         edge_supplement: Add four half-size Gaussians on edge pixels.
         edge_low: Lower Canny threshold.
         edge_high: Upper Canny threshold.
+        least_weight: A new Gaussian whose blending weights in its own frame add up to less (pixels) goes; 0 keeps all.
         uncovered_silhouette: Pixels with a smaller silhouette get Gaussians.
         uncovered_depth_factor: So do those whose rendered depth lies behind by this many median errors; 0 never.
         uncovered_color_error: So do those whose mean channel difference is larger than this; 0 never.
@@ -215,6 +218,8 @@ class MapperSettings:
     iterations_head: Count = 30
     iterations_regular: Count = 30
     iterations_seal: Count = 0
+    seal_rate_first: Positive = 1.0
+    seal_rate_last: Positive = 1.0
     enough_loss: NonNegative = 0.0
     learning_rate_color: NonNegative = 0.0025
     learning_rate_log_radius: NonNegative = 0.005
@@ -234,6 +239,7 @@ class MapperSettings:
     edge_supplement: bool = False
     edge_low: NonNegative = 50.0
     edge_high: NonNegative = 200.0
+    least_weight: NonNegative = 0.0
     uncovered_silhouette: Fraction = 0.5
     uncovered_depth_factor: NonNegative = 50.0
     uncovered_color_error: NonNegative = 0.0

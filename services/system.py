@@ -19,7 +19,7 @@ from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.masks import mean_depth_m, world_points_m
 from vtslam.services.tracker.state import ExternalPose, TrackerState, TrackResult
 
-_RESIDENT_SECTIONS = 6  # sealed sections kept in memory: the previous one and those a head compares
+_RESIDENT_SECTIONS = 3  # sealed sections kept in memory: the previous one and the last that heads compared
 
 
 class Archive(Protocol):

@@ -49,8 +49,12 @@ class Adam:
         self.m = np.concatenate([self.m, added])
         self.v = np.concatenate([self.v, added])
 
-    def step(self, parameters: FloatArray, gradients: FloatArray) -> None:
-        """Move ``parameters`` in place by one step against ``gradients`` (both float32, shape of the state).
+    def select(self, rows: npt.NDArray[np.bool_]) -> None:
+        """Keep the rows where ``rows``, bool [N], is set."""
+        self.m, self.v = self.m[rows], self.v[rows]
+
+    def step(self, parameters: FloatArray, gradients: FloatArray, *, rate: float = 1.0) -> None:
+        """Move ``parameters`` in place a step of ``rate * lr`` against ``gradients`` (float32, shape of the state).
 
         Raises:
             ValueError: An array is misshapen, of another type, not contiguous, or the parameters are read-only.
@@ -62,5 +66,5 @@ class Adam:
         self.step_count += 1
         flat: list[npt.NDArray[np.float32]] = [a.reshape(-1) for a in (parameters, gradients, self.m, self.v)]
         _native.adam_step(
-            flat[0], flat[1], flat[2], flat[3], self.lr, *self.betas, self.eps, self.step_count, self._threads
+            flat[0], flat[1], flat[2], flat[3], rate * self.lr, *self.betas, self.eps, self.step_count, self._threads
         )

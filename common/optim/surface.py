@@ -7,7 +7,8 @@ from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim import _align
 
 _MAX_RELATIVE_DEPTH_STEP = 0.05  # neighbours further apart than this share no surface
-_STRIDE_PX = 2  # a plane fit covers 9x9 pixels: denser points say nothing new
+_STRIDE_PX = 2  # a plane fit covers 9x9 pixels: denser points say nothing new ...
+_STRIDE_WIDTH_PX = 320  # ... at this image width; wider images have more pixels, not more surface
 
 
 def normals_from_depth(depth_m: npt.NDArray[np.float32], camera: Camera) -> npt.NDArray[np.float32]:
@@ -26,7 +27,9 @@ def measured_surface(
     *,
     depth_scale_m: float,
 ) -> npt.NDArray[np.float32]:
-    """Every other pixel's point (m) and unit normal in section coordinates, float32 [M,6].
+    """Points (m) and unit normals of a grid of pixels in section coordinates, float32 [M,6].
+
+    The grid has every other pixel at 320 pixels of width, and is as fine in angle for wider images.
 
     Args:
         depth: uint16 [H,W], as measured.
@@ -35,7 +38,8 @@ def measured_surface(
         depth_scale_m: Metres per unit of depth.
     """
     depth_m = depth.astype(np.float32) * np.float32(depth_scale_m)
-    part = (slice(None, None, _STRIDE_PX), slice(None, None, _STRIDE_PX))
+    stride = max(_STRIDE_PX, round(_STRIDE_PX * camera.width / _STRIDE_WIDTH_PX))
+    part = (slice(None, None, stride), slice(None, None, stride))
     normals = normals_from_depth(depth_m, camera)[part].reshape(-1, 3)
     points = camera.back_projected(depth_m)[part].reshape(-1, 3)
     known = np.flatnonzero(normals.any(axis=1))

@@ -75,7 +75,9 @@ class Gradients:
     Attributes:
         colors: [N,3]. log_radii: [N]. opacity_logits: [N].
         means_m: [N,3] in the frame of the splats' means, or None if not asked for.
-        pose: float64 [6] for ``exp(xi) @ T_camera_map`` at xi = 0, xi = (translation m, rotation rad).
+        weights: [N], no derivative: the sum over pixels of alpha T with which each was blended; None if not asked for.
+        pose: float64 [6] for ``exp(xi) @ T_camera_map`` at xi = 0, xi = (translation m, rotation rad);
+            zero if not asked for.
     """
 
     colors: FloatArray
@@ -83,6 +85,7 @@ class Gradients:
     opacity_logits: FloatArray
     means_m: FloatArray | None
     pose: npt.NDArray[np.float64]
+    weights: FloatArray | None = None
 
 
 class Engine(Protocol):
@@ -103,6 +106,8 @@ class Engine(Protocol):
         d_depth: FloatArray,
         d_alpha: FloatArray | None = None,
         want_means: bool = False,
+        want_pose: bool = True,
+        want_weights: bool = False,
     ) -> Gradients:
-        """Pull image derivatives (shapes as in the rendering) back to the Gaussians and the pose."""
+        """Pull image derivatives (shapes as in the rendering) back to the Gaussians and, if wanted, the pose."""
         ...

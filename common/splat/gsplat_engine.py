@@ -120,6 +120,8 @@ class GsplatEngine:
         d_depth: FloatArray,
         d_alpha: FloatArray | None = None,
         want_means: bool = False,
+        want_pose: bool = True,
+        want_weights: bool = False,
     ) -> Gradients:
         """Pull image derivatives (numpy or tensors) back, through gsplat's own backward pass.
 
@@ -139,8 +141,17 @@ class GsplatEngine:
             log_radii=log_radii,
             opacity_logits=opacity_logits,
             means_m=means if want_means else None,
-            pose=found[4].double().cpu().numpy(),
+            pose=found[4].double().cpu().numpy() if want_pose else np.zeros(6),
+            weights=_given_back(_weights(saved), saved) if want_weights else None,
         )
+
+
+def _weights(saved: _Saved) -> torch.Tensor:
+    """Sums [N] of blending weights: the derivative of an image channel's sum by that channel's colours."""
+    colors = saved.leaves.colors
+    if colors.shape[0] == 0:
+        return torch.zeros_like(colors[:, 0])
+    return torch.autograd.grad(saved.images[0][..., 0].sum(), colors, retain_graph=True)[0][:, 0]
 
 
 def _given_back(tensor: torch.Tensor, saved: _Saved) -> FloatArray:

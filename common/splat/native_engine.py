@@ -107,6 +107,7 @@ class NativeEngine:
         want_means: bool = False,
         want_attributes: bool = True,
         want_pose: bool = True,
+        want_weights: bool = False,
     ) -> Gradients:
         """Pull image derivatives back to the Gaussians and the pose.
 
@@ -120,6 +121,7 @@ class NativeEngine:
             want_means: Also the derivative by the means.
             want_attributes: Derivatives by colours, log radii and opacity logits.
             want_pose: Derivative by the pose.
+            want_weights: Also how much each Gaussian shows; with ``want_attributes`` only.
 
         Raises:
             ValueError: An array is misshapen, of another type, not contiguous, or holds NaN or infinity.
@@ -130,8 +132,8 @@ class NativeEngine:
         if d_alpha is not None:
             checked("d_alpha", d_alpha, np.float32, size)
         saved = rendering.saved
-        colors, log_radii, opacity_logits, means_m, pose = _native.backward(
-            saved, d_rgb, d_depth, d_alpha, want_attributes, want_pose, want_means, self._threads
+        colors, log_radii, opacity_logits, means_m, weights, pose = _native.backward(
+            saved, d_rgb, d_depth, d_alpha, want_attributes, want_pose, want_means, want_weights, self._threads
         )
         count = saved.count
         return Gradients(
@@ -140,4 +142,5 @@ class NativeEngine:
             opacity_logits=np.zeros(count, np.float32) if opacity_logits is None else opacity_logits,
             means_m=means_m,
             pose=np.array(pose) if want_pose else np.zeros(6),
+            weights=weights,
         )

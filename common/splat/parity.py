@@ -51,7 +51,7 @@ class ParityReport:
         scene: Its name. pixels, left_out: Number of pixels, and of those too near to a cut.
         rgb, depth, alpha: Largest error over the pixels kept; depth relative to the reference's.
         rgb_mean, depth_mean, alpha_mean: Mean error over all pixels.
-        gradients: Relative L1 error by name: colors, log_radii, opacity_logits, means_m, pose.
+        gradients: Relative L1 error by name: colors, log_radii, opacity_logits, means_m, pose, weights.
     """
 
     scene: str
@@ -113,10 +113,13 @@ def _gradient_errors(
     d_rgb, d_depth, d_alpha = scene.d_rgb * keep[..., None], scene.d_depth * keep, scene.d_alpha * keep
     names = ("means_m", "colors", "log_radii", "opacity_logits", "pose")
     truth = ReferenceEngine.backward_torch(expected.saved, d_rgb, d_depth, d_alpha)
-    ours = engine.backward(given, d_rgb=d_rgb, d_depth=d_depth, d_alpha=d_alpha, want_means=True)
-    return {
+    ours = engine.backward(given, d_rgb=d_rgb, d_depth=d_depth, d_alpha=d_alpha, want_means=True, want_weights=True)
+    errors = {
         name: _relative_l1(getattr(ours, name), gradient.numpy()) for name, gradient in zip(names, truth, strict=True)
     }
+    assert ours.weights is not None
+    weights = ReferenceEngine.weights_torch(expected.saved).numpy()
+    return {**errors, "weights": _relative_l1(ours.weights, weights)}
 
 
 def pose_difference_error(engine: Engine, scene: Scene) -> float:

@@ -162,6 +162,8 @@ class ReferenceEngine:
         d_depth: FloatArray,
         d_alpha: FloatArray | None = None,
         want_means: bool = False,
+        want_pose: bool = True,
+        want_weights: bool = False,
     ) -> Gradients:
         """Pull image derivatives back, by autograd.
 
@@ -175,7 +177,8 @@ class ReferenceEngine:
             log_radii=_float32(log_radii),
             opacity_logits=_float32(opacity_logits),
             means_m=_float32(means) if want_means else None,
-            pose=pose.numpy(),
+            pose=pose.numpy() if want_pose else np.zeros(6),
+            weights=_float32(self.weights_torch(saved)) if want_weights else None,
         )
 
     @staticmethod
@@ -193,6 +196,14 @@ class ReferenceEngine:
             images, leaves, cotangents, retain_graph=True, allow_unused=True, materialize_grads=True
         )
         return [gradient.detach() for gradient in gradients]
+
+    @staticmethod
+    def weights_torch(saved: _Saved) -> torch.Tensor:
+        """Float64 sums [N] of blending weights: the derivative of an image channel's sum by that channel's colours."""
+        red = saved.images.rgb[..., 0].sum()
+        colors = saved.leaves.colors
+        (gradient,) = torch.autograd.grad(red, [colors], retain_graph=True, allow_unused=True, materialize_grads=True)
+        return gradient[:, 0].detach()
 
 
 def _float32(tensor: torch.Tensor) -> FloatArray:

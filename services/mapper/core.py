@@ -66,10 +66,10 @@ class Mapper:
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None)
         bundle = HeadBundle(T_world_camera, self.settings)
         if section.gaussians.count:
-            for _ in range(self.settings.iterations_head):
+            for step in range(self.settings.iterations_head):
                 if optimiser.good_enough():
                     break
-                pose_gradient = optimiser.step(view, with_neighbours=True)
+                pose_gradient = optimiser.step(view, with_neighbours=True, drop_hidden=step == 0)
                 optimiser.move_anchor(bundle.moved(pose_gradient))
         result = optimiser.finished()
         active = ActiveSection(
@@ -78,7 +78,7 @@ class Mapper:
             neighbour_ids=tuple(n.section_id for n in neighbours),
             moments=result.moments,
         )
-        added = section.gaussians.count
+        added = active.section.gaussians.count
         return active, self._record(frame, active, result, added, held_out=False)
 
     def map_regular(
@@ -113,11 +113,16 @@ class Mapper:
         stored = self._section_frame(frame, T_section_frame, row, exposure, held_out=held_out)
         section = active.section.grown(stored, new)
         chosen = self._random_views(frame.frame_id, len(views), self.settings.iterations_regular)
-        result = self._optimised(section, neighbours, active, views, chosen)
+        if new.count and self.settings.least_weight > 0:
+            chosen[:1] = len(views) - 1  # its own view first: it shows which of the new ones are hidden
+        result = self._optimised(
+            section, neighbours, active, views, chosen, rates=np.ones(chosen.size), drop_hidden=new.count > 0
+        )
         grown = ActiveSection(
             section=result.section, views=views, neighbour_ids=active.neighbour_ids, moments=result.moments
         )
-        return grown, self._record(frame, grown, result, new.count, held_out=held_out)
+        added = grown.section.gaussians.count - active.section.gaussians.count
+        return grown, self._record(frame, grown, result, added, held_out=held_out)
 
     def seal(self, active: ActiveSection, *, neighbours: list[Section]) -> tuple[Section, int]:
         """Finish a section: a last round over all its views; afterwards its payload never changes.
@@ -128,7 +133,8 @@ class Mapper:
         count = self.settings.iterations_seal
         key = self._section_key(active.section)
         chosen = self._even_views(key, len(active.views), count)
-        result = self._optimised(active.section, neighbours, active, active.views, chosen)
+        rates = np.geomspace(self.settings.seal_rate_first, self.settings.seal_rate_last, count)
+        result = self._optimised(active.section, neighbours, active, active.views, chosen, rates=rates)
         section = result.section
         last = active.views[-1]
         frames = list(section.frames)
@@ -143,14 +149,23 @@ class Mapper:
         active: ActiveSection,
         views: tuple[TrainingView, ...],
         chosen: npt.NDArray[np.int64],
+        *,
+        rates: npt.NDArray[np.float64],
+        drop_hidden: bool = False,
     ) -> Optimised:
+        """The section after a step on each of the chosen views; at the first one hidden Gaussians may be dropped."""
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
-            for index in chosen:
+            for step, (index, rate) in enumerate(zip(chosen, rates, strict=True)):
                 if optimiser.good_enough():
                     break
                 # The head alone is shared with the neighbours (docs/method.md, 3.3).
-                optimiser.step(views[index], with_neighbours=index == 0)
+                optimiser.step(
+                    views[index],
+                    with_neighbours=index == 0,
+                    rate=float(rate),
+                    drop_hidden=drop_hidden and step == 0,
+                )
         return optimiser.finished()
 
     def _section_frame(

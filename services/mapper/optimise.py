@@ -82,15 +82,26 @@ class SectionOptimiser:
         span = np.float32(np.log(max(settings.radius_limit, 1.0)))
         self._log_radius_bounds = (first - span, first + span)
 
-    def step(self, view: TrainingView, *, with_neighbours: bool) -> npt.NDArray[np.float64]:
+    def step(
+        self, view: TrainingView, *, with_neighbours: bool, rate: float = 1.0, drop_hidden: bool = False
+    ) -> npt.NDArray[np.float64]:
         """One step on ``view``: Eq. 2 on the section alone, and if asked on the section with its neighbours.
+
+        Args:
+            view: The frame rendered against.
+            with_neighbours: Whether to add the joint loss.
+            rate: Factor on the learning rates.
+            drop_hidden: Afterwards leave out the view's own Gaussians that others cover there (``least_weight``).
 
         Returns:
             The gradient [6] of the joint loss with respect to a left twist on the section's own camera pose relative
             to its neighbours (zero without neighbours): what bundle adjustment of a head descends along.
         """
         T_camera_section = se3.inverse(self._section.frames[view.frame_index].T_section_frame)
-        gradients, value = self._loss_gradients(self._splats(), view, T_camera_section, want_means=False)
+        want_weights = drop_hidden and self._settings.least_weight > 0
+        gradients, value = self._loss_gradients(
+            self._splats(), view, T_camera_section, want_means=False, want_weights=want_weights
+        )
         colors, log_radii, opacity_logits = gradients.colors, gradients.log_radii, gradients.opacity_logits
         pose_gradient = np.zeros(6)
         weight = self._settings.neighbour_weight
@@ -104,12 +115,36 @@ class SectionOptimiser:
             value += weight * joint_loss
             pose_gradient = _camera_twist_gradient(joined, joint, own, T_camera_section)
         self._losses.append(value)
-        self._moments.colors.step(self._colors, colors)
-        self._moments.log_radii.step(self._log_radii, log_radii)
-        self._moments.opacity_logits.step(self._opacity_logits, opacity_logits)
+        self._move(colors, log_radii, opacity_logits, rate)
+        if want_weights:
+            assert gradients.weights is not None
+            tied_to_view = self._section.gaussians.frame_index == view.frame_index
+            self._keep(~tied_to_view | (gradients.weights >= self._settings.least_weight))
+        return pose_gradient
+
+    def _move(
+        self,
+        colors: npt.NDArray[np.float32],
+        log_radii: npt.NDArray[np.float32],
+        opacity_logits: npt.NDArray[np.float32],
+        rate: float,
+    ) -> None:
+        """A step of Adam against the gradients given, radii kept within their bounds."""
+        self._moments.colors.step(self._colors, colors, rate=rate)
+        self._moments.log_radii.step(self._log_radii, log_radii, rate=rate)
+        self._moments.opacity_logits.step(self._opacity_logits, opacity_logits, rate=rate)
         if self._settings.radius_limit > 0:
             np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
-        return pose_gradient
+
+    def _keep(self, rows: npt.NDArray[np.bool_]) -> None:
+        """Leave out all Gaussians but those of ``rows``, bool [N]."""
+        self._section = self._section.selected(rows)
+        self._colors, self._log_radii = self._colors[rows], self._log_radii[rows]
+        self._opacity_logits = self._opacity_logits[rows]
+        low, high = self._log_radius_bounds
+        self._log_radius_bounds = (low[rows], high[rows])
+        for moments in (self._moments.colors, self._moments.log_radii, self._moments.opacity_logits):
+            moments.select(rows)
 
     def good_enough(self) -> bool:
         """Whether the last few steps found a loss below ``enough_loss``: more would fit these views, not the scene."""
@@ -145,21 +180,33 @@ class SectionOptimiser:
         return replace(self._section, gaussians=gaussians)
 
     def _loss_gradients(
-        self, splats: Splats, view: TrainingView, T_camera_section: npt.NDArray[np.float64], *, want_means: bool
+        self,
+        splats: Splats,
+        view: TrainingView,
+        T_camera_section: npt.NDArray[np.float64],
+        *,
+        want_means: bool,
+        want_weights: bool = False,
     ) -> tuple[Gradients, float]:
         rendering = self._engine.render(splats, view.frame.camera, T_camera_section)
         self._renders += 1
         loss = mapping_loss(
-            view.exposure.applied(rendering.rgb),
+            rendering.rgb,
             rendering.depth_m,
-            view.frame.rgb_float(),
+            view.exposure.removed_from(view.frame.rgb),
             view.frame.depth_m(),
             weight_color=self._settings.color_weight,
             weight_depth=self._settings.depth_weight,
             ssim_share=self._settings.ssim_share,
         )
-        d_rgb = view.exposure.pulled_back(loss.d_rgb)
-        gradients = self._engine.backward(rendering, d_rgb=d_rgb, d_depth=loss.d_depth, want_means=want_means)
+        gradients = self._engine.backward(
+            rendering,
+            d_rgb=loss.d_rgb,
+            d_depth=loss.d_depth,
+            want_means=want_means,
+            want_pose=False,
+            want_weights=want_weights,
+        )
         return gradients, loss.loss
 
 

@@ -148,9 +148,17 @@ class _Altered:
         d_depth: FloatArray,
         d_alpha: FloatArray | None = None,
         want_means: bool = False,
+        want_pose: bool = True,
+        want_weights: bool = False,
     ) -> Gradients:
         gradients = self._engine.backward(
-            rendering, d_rgb=d_rgb, d_depth=d_depth, d_alpha=d_alpha, want_means=want_means
+            rendering,
+            d_rgb=d_rgb,
+            d_depth=d_depth,
+            d_alpha=d_alpha,
+            want_means=want_means,
+            want_pose=want_pose,
+            want_weights=want_weights,
         )
         right = getattr(gradients, self._fault, None)
         if right is None:

@@ -41,8 +41,6 @@ def test_applying_and_removing_are_inverse_and_the_identity_copies_nothing() -> 
     np.testing.assert_allclose(WARM.removed(WARM.applied(colors)), colors, atol=1e-6)
     assert IDENTITY.applied(colors) is colors
     assert IDENTITY.removed(colors) is colors
-    assert IDENTITY.pulled_back(colors) is colors
-    np.testing.assert_array_equal(WARM.pulled_back(colors), colors * WARM.gain)
 
 
 def test_an_exposure_is_found_again_though_a_third_of_the_pixels_disagree() -> None:

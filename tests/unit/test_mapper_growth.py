@@ -69,6 +69,40 @@ def test_the_edge_supplement_adds_four_on_edges() -> None:
     np.testing.assert_array_equal(np.unique(active.section.gaussians.pixel[extra]), np.flatnonzero(edges))
 
 
+def test_gaussians_that_others_cover_in_their_own_frame_are_dropped() -> None:
+    settings = replace(SMALL_MAPPER, edge_supplement=True, initial_opacity=0.95, iterations_head=1)
+    _, every, _ = opened(settings)
+    _, active, record = opened(replace(settings, least_weight=0.02))
+    assert record.gaussians_added == record.gaussians == active.section.gaussians.count
+    assert active.section.means_m.shape == (record.gaussians, 3)
+    assert record.gaussians < 0.9 * every.section.gaussians.count
+    engine, camera = small_mapper(settings).engine, room_frame(0).camera
+    full = engine.render(every.section.splats, camera, np.eye(4))
+    thinned = engine.render(active.section.splats, camera, np.eye(4))
+    assert np.abs(full.rgb - thinned.rgb).mean() < 0.005
+    kept = {row.tobytes() for row in every.section.gaussians.colors}
+    assert all(row.tobytes() in kept for row in active.section.gaussians.colors)
+
+
+def test_only_the_new_frames_gaussians_can_be_dropped_and_their_moments_follow() -> None:
+    settings = replace(
+        SMALL_MAPPER, keep_moments=True, least_weight=0.1, iterations_head=2, edge_supplement=True, initial_opacity=0.95
+    )
+    mapper, active, _ = opened(settings)
+    before = active.section.gaussians.count
+    grown, record = mapper.map_regular(room_frame(4), room_pose(4), active, neighbours=[])
+    gaussians = grown.section.gaussians
+    assert np.count_nonzero(gaussians.frame_index == 0) == before
+    assert 0 < record.gaussians_added == gaussians.count - before
+    free, unpruned = small_mapper(replace(settings, least_weight=0.0)).map_regular(
+        room_frame(4), room_pose(4), active, neighbours=[]
+    )
+    assert unpruned.gaussians_added > record.gaussians_added
+    assert free.section.gaussians.count == before + unpruned.gaussians_added
+    assert grown.moments is not None
+    assert grown.moments.colors.m.shape == (gaussians.count, 3)
+
+
 def test_a_regular_frame_adds_where_the_section_shows_nothing() -> None:
     mapper, active, _ = opened(NO_STEPS)
     pose = room_pose(4)

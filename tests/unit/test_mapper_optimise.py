@@ -41,6 +41,19 @@ def test_steps_lower_the_loss() -> None:
         assert losses[-1] < 0.8 * losses[0]
 
 
+def test_the_last_steps_of_a_section_are_as_small_as_asked() -> None:
+    settings = replace(STILL, iterations_seal=3)
+    moved = []
+    for last in (1.0, 1e-6):
+        mapper = small_mapper(replace(settings, seal_rate_first=last, seal_rate_last=last))
+        active, _ = mapper.map_head(VIEW.frame, room_pose(6), section_id=1, neighbours=[])
+        sealed, renders = mapper.seal(active, neighbours=[])
+        assert renders == 3
+        moved.append(np.abs(sealed.gaussians.colors - active.section.gaussians.colors).max())
+    assert moved[0] > 1e-3
+    assert moved[1] < 1e-5
+
+
 def test_only_colour_radius_and_opacity_are_learned() -> None:
     before = fresh_section()
     run = optimiser(SMALL_MAPPER, [])

@@ -176,6 +176,19 @@ def test_adam_grows_by_rows_without_moments() -> None:
     assert (np.abs(x[5]) > np.abs(x[0])).all()
 
 
+def test_adam_steps_by_a_share_of_its_rate_and_keeps_chosen_rows() -> None:
+    gradients = np.array([[1.0], [-2.0], [3.0]], np.float32)
+    half, whole = Adam((3, 1), lr=0.1, eps=1e-9), Adam((3, 1), lr=0.05, eps=1e-9)
+    a, b = np.zeros((3, 1), np.float32), np.zeros((3, 1), np.float32)
+    half.step(a, gradients, rate=0.5)
+    whole.step(b, gradients)
+    assert a.tobytes() == b.tobytes()
+    assert (a != 0).all()
+    half.select(np.array([True, False, True]))
+    np.testing.assert_array_equal(half.m, whole.m[[0, 2]])
+    np.testing.assert_array_equal(half.v, whole.v[[0, 2]])
+
+
 def test_adam_refuses_misfit_arrays() -> None:
     adam = Adam((4,), lr=0.1)
     with pytest.raises(ValueError, match=r"gradients must be float32 \[4\], got float32 \[5\]"):

@@ -29,7 +29,7 @@ VTSLAM_INLINE bool all_finite(const float* values, size_t count) {
 
 VTSLAM_INLINE bool radii_in_range(const float* log_radii, size_t count) {
   uint32_t bad = 0;
-  for (size_t i = 0; i < count; ++i) bad |= uint32_t(__builtin_fabsf(log_radii[i]) > kMaxLogRadius);
+  for (size_t i = 0; i < count; ++i) bad |= uint32_t(!(__builtin_fabsf(log_radii[i]) <= kMaxLogRadius));
   return bad == 0;
 }
 
@@ -131,28 +131,37 @@ VTSLAM_INLINE void keep_geometry(const Group& group, uint32_t first, int count, 
   for (int l = 0; l < count; ++l) geometry.opacity_complement[first + l] = group.opacity_complement[l];
 }
 
+// Whether all inputs of a group are finite and in range.
+VTSLAM_INLINE bool valid_group(const float* means, const float* colors, const float* log_radii, const float* logits) {
+  return all_finite(means, 3 * kGroup) & all_finite(colors, 3 * kGroup) & all_finite(logits, kGroup) &
+         radii_in_range(log_radii, kGroup);
+}
+
 bool project(const ProjectArgs& args, uint32_t begin, uint32_t end, uint32_t* tile_counts, uint64_t* pairs) {
   const SplatInputs& in = args.inputs;
-  const size_t size = end - begin;
-  const bool valid = all_finite(in.means + 3 * size_t(begin), 3 * size) &&
-                     all_finite(in.colors + 3 * size_t(begin), 3 * size) && all_finite(in.log_radii + begin, size) &&
-                     all_finite(in.opacity_logits + begin, size) && radii_in_range(in.log_radii + begin, size);
-  if (!valid) return false;
   Group group;
+  float padded[8 * kGroup];  // the last group, filled up
   uint64_t slots = 0;
+  bool valid = true;
   for (uint32_t first = begin; first < end; first += kGroup) {
     const int count = end - first < kGroup ? int(end - first) : kGroup;
-    if (count == kGroup) {
-      activate(in.log_radii + first, in.opacity_logits + first, group);
-      project_group(args.view, args.settings, in.means + 3 * size_t(first), group);
-    } else {
-      float means[3 * kGroup] = {}, log_radii[kGroup] = {}, logits[kGroup] = {};
-      for (int i = 0; i < 3 * count; ++i) means[i] = in.means[3 * size_t(first) + i];
-      for (int i = 0; i < count; ++i) log_radii[i] = in.log_radii[first + i];
-      for (int i = 0; i < count; ++i) logits[i] = in.opacity_logits[first + i];
-      activate(log_radii, logits, group);
-      project_group(args.view, args.settings, means, group);
+    const float *means = in.means + 3 * size_t(first), *colors = in.colors + 3 * size_t(first);
+    const float *log_radii = in.log_radii + first, *logits = in.opacity_logits + first;
+    if (count < kGroup) {
+      for (float& value : padded) value = 0.0f;
+      for (int i = 0; i < 3 * count; ++i) padded[i] = means[i];
+      for (int i = 0; i < 3 * count; ++i) padded[3 * kGroup + i] = colors[i];
+      for (int i = 0; i < count; ++i) padded[6 * kGroup + i] = log_radii[i];
+      for (int i = 0; i < count; ++i) padded[7 * kGroup + i] = logits[i];
+      means = padded;
+      colors = padded + 3 * kGroup;
+      log_radii = padded + 6 * kGroup;
+      logits = padded + 7 * kGroup;
     }
+    valid &= valid_group(means, colors, log_radii, logits);
+    if (!valid) break;
+    activate(log_radii, logits, group);
+    project_group(args.view, args.settings, means, group);
     keep_geometry(group, first, count, args.geometry);
     for (int l = 0; l < count; ++l) {
       const uint32_t i = first + l;
@@ -162,7 +171,7 @@ bool project(const ProjectArgs& args, uint32_t begin, uint32_t end, uint32_t* ti
         rect = {uint16_t(group.left[l] / kTile), uint16_t(group.right[l] / kTile), uint16_t(group.top[l] / kTile),
                 uint16_t(group.bottom[l] / kTile)};
         SplatRecord& record = args.records[i];
-        write_record(group, l, in.colors + 3 * size_t(i), record);
+        write_record(group, l, colors + 3 * l, record);
         record.slot_stride = rect.right - rect.left + 1u;
         record.slot_base = uint32_t(slots) - rect.top * record.slot_stride - rect.left;
         slots += uint64_t(record.slot_stride) * (rect.bottom - rect.top + 1u);
@@ -173,7 +182,7 @@ bool project(const ProjectArgs& args, uint32_t begin, uint32_t end, uint32_t* ti
     }
   }
   *pairs = slots;
-  return true;
+  return valid;
 }
 
 // Sums of one Gaussian over its tiles, in the order of kSum*; the order of addition is that of the tiles.
@@ -189,19 +198,19 @@ struct ChainGroup {
   alignas(64) float sums[kGroup][kSlotFloats];
   alignas(64) float conic_xx[kGroup], conic_xy[kGroup], conic_yy[kGroup];
   alignas(64) float x[kGroup], y[kGroup], z[kGroup], sigma[kGroup];
-  alignas(64) double d_log_radius[kGroup], d_point[3][kGroup];
+  alignas(64) float d_log_radius[kGroup];
+  alignas(64) double d_point[3][kGroup], pose[6][kGroup];
 };
 
 // Derivatives by log radius and camera point from the sums over pixels. With K the conic, M the second moments and
 // m the first ones: dL/d(mean) = K m, dL/d(covariance) = K M K / 2; then through the projection and its Jacobian.
+template <bool geometry>
 VTSLAM_INLINE void chain_group(const View& view, ChainGroup& g) {
   for (int l = 0; l < kGroup; ++l) {
     const float* s = g.sums[l];
-    const double mx = s[slot_lane(kSumX)], my = s[slot_lane(kSumY)];
     const double mxx = s[slot_lane(kSumXX)], mxy = s[slot_lane(kSumXY)], myy = s[slot_lane(kSumYY)];
     const double ka = double(g.conic_xx[l]) * (-2.0 * kLn2), kb = double(g.conic_xy[l]) * double(-kLn2);
     const double kc = double(g.conic_yy[l]) * (-2.0 * kLn2);
-    const double d_u = ka * mx + kb * my, d_v = kb * mx + kc * my;
     const double p00 = ka * mxx + kb * mxy, p01 = ka * mxy + kb * myy;
     const double p10 = kb * mxx + kc * mxy, p11 = kb * mxy + kc * myy;
     const double d_a = 0.5 * (p00 * ka + p01 * kb), d_b = p00 * kb + p01 * kc, d_c = 0.5 * (p10 * kb + p11 * kc);
@@ -209,12 +218,46 @@ VTSLAM_INLINE void chain_group(const View& view, ChainGroup& g) {
     const double k = double(g.sigma[l]) * double(g.sigma[l]) * inverse_z * inverse_z;
     const double qa = k * view.fx * view.fx, qb = k * view.fx * view.fy, qc = k * view.fy * view.fy;
     const double by_scale = 2.0 * (d_a * qa * (1.0 + xn * xn) + d_b * qb * xn * yn + d_c * qc * (1.0 + yn * yn));
+    g.d_log_radius[l] = float(by_scale);
+    if (!geometry) continue;
+    const double mx = s[slot_lane(kSumX)], my = s[slot_lane(kSumY)];
+    const double d_u = ka * mx + kb * my, d_v = kb * mx + kc * my;
     const double d_xn = view.fx * d_u + 2.0 * d_a * qa * xn + d_b * qb * yn;
     const double d_yn = view.fy * d_v + 2.0 * d_c * qc * yn + d_b * qb * xn;
-    g.d_log_radius[l] = by_scale;
-    g.d_point[0][l] = d_xn * inverse_z;
-    g.d_point[1][l] = d_yn * inverse_z;
-    g.d_point[2][l] = double(s[slot_lane(kSumDepth)]) - (d_xn * xn + d_yn * yn + by_scale) * inverse_z;
+    const double gx = d_xn * inverse_z, gy = d_yn * inverse_z;
+    const double gz = double(s[slot_lane(kSumDepth)]) - (d_xn * xn + d_yn * yn + by_scale) * inverse_z;
+    g.d_point[0][l] = gx;
+    g.d_point[1][l] = gy;
+    g.d_point[2][l] = gz;
+    g.pose[0][l] += gx;
+    g.pose[1][l] += gy;
+    g.pose[2][l] += gz;
+    g.pose[3][l] += g.y[l] * gz - g.z[l] * gy;
+    g.pose[4][l] += g.z[l] * gx - g.x[l] * gz;
+    g.pose[5][l] += g.x[l] * gy - g.y[l] * gx;
+  }
+}
+
+// Sums over tiles and what the chain rule needs of Gaussian i, or if it has no pixel a harmless stand-in with zero
+// sums, so that the arithmetic stays finite.
+VTSLAM_INLINE void gather(const ChainArgs& args, uint32_t i, bool present, ChainGroup& g, int l) {
+  if (present) {
+    const SplatRecord& record = args.records[i];
+    const TileRect rect = args.rects[i];
+    const uint32_t slots = uint32_t(rect.right - rect.left + 1) * uint32_t(rect.bottom - rect.top + 1);
+    const size_t start = size_t(args.chunk_bases[i >> args.chunk_shift]) + args.slot_starts[i];
+    add_slots(args.slots + start * kSlotFloats, slots, g.sums[l]);
+    g.conic_xx[l] = record.conic_xx;
+    g.conic_xy[l] = record.conic_xy;
+    g.conic_yy[l] = record.conic_yy;
+    g.x[l] = args.geometry.x[i];
+    g.y[l] = args.geometry.y[i];
+    g.z[l] = args.geometry.z[i];
+    g.sigma[l] = args.geometry.sigma[i];
+  } else {
+    add_slots(args.slots, 0, g.sums[l]);
+    g.conic_xx[l] = g.conic_xy[l] = g.conic_yy[l] = g.x[l] = g.y[l] = g.sigma[l] = 0.0f;
+    g.z[l] = 1.0f;
   }
 }
 
@@ -225,7 +268,8 @@ VTSLAM_INLINE void write_gradients(const ChainArgs& args, const ChainGroup& g, i
     args.d_colors[3 * size_t(i) + 1] = s[slot_lane(kSumGreen)];
     args.d_colors[3 * size_t(i) + 2] = s[slot_lane(kSumBlue)];
     args.d_opacity_logits[i] = s[slot_lane(kSumAlpha)] * args.geometry.opacity_complement[i];
-    args.d_log_radii[i] = float(g.d_log_radius[l]);
+    args.d_log_radii[i] = g.d_log_radius[l];
+    if (args.weights != nullptr) args.weights[i] = s[slot_lane(kSumWeight)];
   }
   if (args.d_means == nullptr) return;
   const double* r = args.view.rotation;
@@ -234,39 +278,25 @@ VTSLAM_INLINE void write_gradients(const ChainArgs& args, const ChainGroup& g, i
     args.d_means[3 * size_t(i) + axis] = float(r[axis] * gx + r[3 + axis] * gy + r[6 + axis] * gz);
 }
 
-void chain(const ChainArgs& args, uint32_t begin, uint32_t end, double* pose) {
+template <bool geometry>
+VTSLAM_INLINE void chain_range(const ChainArgs& args, uint32_t begin, uint32_t end, double* pose) {
   ChainGroup g = {};
   for (uint32_t first = begin; first < end; first += kGroup) {
     const int count = end - first < kGroup ? int(end - first) : kGroup;
-    for (int l = 0; l < kGroup; ++l) {
-      const uint32_t i = first + l;
-      const bool empty = l >= count || args.rects[i].left > args.rects[i].right;
-      // Gaussians without a pixel get a harmless stand-in with zero sums, so that the arithmetic stays finite.
-      const SplatRecord& record = args.records[empty ? begin : i];
-      const TileRect rect = empty ? TileRect{1, 0, 1, 0} : args.rects[i];
-      const uint32_t slots = empty ? 0 : uint32_t(rect.right - rect.left + 1) * uint32_t(rect.bottom - rect.top + 1);
-      const size_t start = empty ? 0 : size_t(args.chunk_bases[i >> args.chunk_shift]) + args.slot_starts[i];
-      add_slots(args.slots + start * kSlotFloats, slots, g.sums[l]);
-      g.conic_xx[l] = empty ? 0.0f : record.conic_xx;
-      g.conic_xy[l] = empty ? 0.0f : record.conic_xy;
-      g.conic_yy[l] = empty ? 0.0f : record.conic_yy;
-      g.x[l] = empty ? 0.0f : args.geometry.x[i];
-      g.y[l] = empty ? 0.0f : args.geometry.y[i];
-      g.z[l] = empty ? 1.0f : args.geometry.z[i];
-      g.sigma[l] = empty ? 0.0f : args.geometry.sigma[i];
-    }
-    chain_group(args.view, g);
-    for (int l = 0; l < count; ++l) {
-      const double gx = g.d_point[0][l], gy = g.d_point[1][l], gz = g.d_point[2][l];
-      write_gradients(args, g, l, first + l);
-      pose[0] += gx;
-      pose[1] += gy;
-      pose[2] += gz;
-      pose[3] += g.y[l] * gz - g.z[l] * gy;
-      pose[4] += g.z[l] * gx - g.x[l] * gz;
-      pose[5] += g.x[l] * gy - g.y[l] * gx;
-    }
+    for (int l = 0; l < kGroup; ++l)
+      gather(args, first + l, l < count && args.rects[first + l].left <= args.rects[first + l].right, g, l);
+    chain_group<geometry>(args.view, g);
+    for (int l = 0; l < count; ++l) write_gradients(args, g, l, first + l);
   }
+  for (int i = 0; i < 6; ++i)
+    for (int l = 0; l < kGroup; ++l) pose[i] += g.pose[i][l];
+}
+
+void chain(const ChainArgs& args, uint32_t begin, uint32_t end, double* pose) {
+  if (args.want_geometry)
+    chain_range<true>(args, begin, end, pose);
+  else
+    chain_range<false>(args, begin, end, pose);
 }
 
 }  // namespace

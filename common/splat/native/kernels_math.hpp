@@ -10,8 +10,8 @@ namespace {
 constexpr float kLog2E = 1.44269504088896f, kLn2 = 0.693147180559945f;
 
 // Sums over pixels that the backward pass keeps for each (Gaussian, tile) pair. With g = alpha dL/dalpha and d the
-// offset of the pixel centre from the mean: colour and depth weights, then the sums of g, g d and g d d^T.
-enum { kSumRed, kSumGreen, kSumBlue, kSumDepth, kSumAlpha, kSumX, kSumY, kSumXX, kSumXY, kSumYY };
+// offset of the pixel centre from the mean: colour and depth weights, the sums of g, g d and g d d^T, and of weights.
+enum { kSumRed, kSumGreen, kSumBlue, kSumDepth, kSumAlpha, kSumX, kSumY, kSumXX, kSumXY, kSumYY, kSumWeight };
 
 // 2^f for f in [0, 1], minimax of degree 5, relative error below 3e-7; in a form with a short chain of dependences.
 VTSLAM_INLINE Vec exp2_fraction(Vec f) {

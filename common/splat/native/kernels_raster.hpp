@@ -74,7 +74,7 @@ VTSLAM_INLINE Limits limits_of(const Settings& settings) {
 VTSLAM_INLINE Blend blend(Vec log2_alpha, Vec transmittance, const Limits& limits) {
   Blend b;
   const Mask present = at_least(log2_alpha, limits.log2_alpha_min);
-  b.alpha = where(present, minimum(exp2_of(log2_alpha), limits.alpha_cap));
+  b.alpha = where(present, minimum(exp2_of(maximum(log2_alpha, limits.log2_alpha_min)), limits.alpha_cap));
   const Vec next = fnma(b.alpha, transmittance, transmittance);
   b.blended = at_least(next, limits.transmittance_min);
   b.weight = where(b.blended, b.alpha * transmittance);
@@ -237,7 +237,10 @@ VTSLAM_INLINE void backward_splats(const BackwardArgs& args, Vec (*state)[kBackw
         const Vec behind = s[kRemaining] * (b.alpha * reciprocal(splat(1.0f) - b.alpha));
         const Vec g = where(both(b.blended, at_least(limits.log2_alpha_cap, log2_alpha)), own - behind);
         const Vec gx = g * dx, gy = g * dy;
-        if (attributes) sums[kSumAlpha] = sums[kSumAlpha] + g;
+        if (attributes) {
+          sums[kSumAlpha] = sums[kSumAlpha] + g;
+          sums[kSumWeight] = sums[kSumWeight] + b.weight;
+        }
         if (geometry) {
           sums[kSumX] = sums[kSumX] + gx;
           sums[kSumY] = sums[kSumY] + gy;

@@ -1,6 +1,7 @@
 #include "memory.hpp"
 
 #include <pthread.h>
+#include <sys/mman.h>
 
 #include <bit>
 #include <cstdlib>
@@ -11,8 +12,9 @@
 namespace vtslam::native {
 namespace {
 
+constexpr std::size_t kHugePage = std::size_t(2) << 20;
 constexpr std::size_t kHeader = 64;  // holds the block's capacity, keeps the alignment
-constexpr std::size_t kKeptBytes = std::size_t(256) << 20;
+constexpr std::size_t kKeptBytes = std::size_t(192) << 20;
 
 struct Cache {
   std::mutex mutex;
@@ -34,6 +36,18 @@ Cache& the_cache() {
 
 std::size_t& capacity_of(void* block) { return *reinterpret_cast<std::size_t*>(static_cast<char*>(block) - kHeader); }
 
+// Large blocks lie in huge pages where the system grants them: tiles read and write all over them, and a miss in the
+// page tables costs as much as the work on a splat.
+void* new_block(std::size_t capacity) {
+  const bool huge = capacity >= kHugePage;
+  const std::size_t alignment = huge ? kHugePage : kHeader;
+  const std::size_t bytes = (capacity + kHeader + alignment - 1) / alignment * alignment;
+  void* memory = std::aligned_alloc(alignment, bytes);
+  if (memory == nullptr) throw std::bad_alloc();
+  if (huge) madvise(memory, bytes, MADV_HUGEPAGE);  // a wish; refused is fine
+  return static_cast<char*>(memory) + kHeader;
+}
+
 void free_block(void* block) { std::free(static_cast<char*>(block) - kHeader); }
 
 // Rounded up to an eighth of a power of two, so that sizes that vary a little share blocks.
@@ -49,17 +63,22 @@ void* acquire_block(std::size_t bytes) {
   Cache& kept = the_cache();
   {
     const std::lock_guard lock(kept.mutex);
-    for (std::size_t i = kept.blocks.size(); i-- > 0;) {
-      void* block = kept.blocks[i];
-      if (capacity_of(block) != capacity) continue;
-      kept.blocks.erase(kept.blocks.begin() + static_cast<std::ptrdiff_t>(i));
-      kept.bytes -= capacity;
+    // A block somewhat too large does, so that a scene that grows leaves no trail of sizes behind.
+    std::size_t best = kept.blocks.size();
+    for (std::size_t i = 0; i < kept.blocks.size(); ++i) {
+      const std::size_t has = capacity_of(kept.blocks[i]);
+      if (has >= capacity && has <= capacity + capacity / 4 &&
+          (best == kept.blocks.size() || has <= capacity_of(kept.blocks[best])))
+        best = i;
+    }
+    if (best < kept.blocks.size()) {
+      void* block = kept.blocks[best];
+      kept.blocks.erase(kept.blocks.begin() + static_cast<std::ptrdiff_t>(best));
+      kept.bytes -= capacity_of(block);
       return block;
     }
   }
-  void* memory = std::aligned_alloc(64, capacity + kHeader);
-  if (memory == nullptr) throw std::bad_alloc();
-  void* block = static_cast<char*>(memory) + kHeader;
+  void* block = new_block(capacity);
   capacity_of(block) = capacity;
   return block;
 }

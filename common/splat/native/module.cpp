@@ -137,13 +137,13 @@ Rendered render_arrays(const Input<float, 2>& means, const Input<float, 2>& colo
           as_array(std::move(image.alpha), {rows, columns}), SavedRendering{std::move(rendering)}};
 }
 
-// Colours, log radii, opacity logits, means (each None where not asked for), pose.
+// Colours, log radii, opacity logits, means, blending weights (each None where not asked for), pose.
 using Pulled = std::tuple<std::optional<Output<float>>, std::optional<Output<float>>, std::optional<Output<float>>,
-                          std::optional<Output<float>>, std::vector<double>>;
+                          std::optional<Output<float>>, std::optional<Output<float>>, std::vector<double>>;
 
 Pulled backward_arrays(const SavedRendering& saved, const Input<float, 3>& d_rgb, const Input<float, 2>& d_depth,
                        const std::optional<Input<float, 2>>& d_alpha, bool want_attributes, bool want_pose,
-                       bool want_means, int threads) {
+                       bool want_means, bool want_weights, int threads) {
   const Rendering* rendering = saved.rendering.get();
   const View& view = view_of(*rendering);
   require_image("d_rgb", d_rgb.shape(0), d_rgb.shape(1), view);
@@ -153,13 +153,16 @@ Pulled backward_arrays(const SavedRendering& saved, const Input<float, 3>& d_rgb
   const std::size_t count = splat_count(*rendering);
   Buffer<float> colors(want_attributes ? 3 * count : 0), log_radii(want_attributes ? count : 0);
   Buffer<float> opacity_logits(want_attributes ? count : 0), means(want_means ? 3 * count : 0);
+  Buffer<float> weights(want_weights ? count : 0);
   GradientArrays gradients{};
   if (want_attributes) {
     gradients.colors = colors.data();
     gradients.log_radii = log_radii.data();
     gradients.opacity_logits = opacity_logits.data();
   }
+  if (want_weights && !want_attributes) throw nb::value_error("weights come with the attributes' derivatives");
   if (want_means) gradients.means = means.data();
+  if (want_weights) gradients.weights = weights.data();
   bool valid = true;
   {
     const nb::gil_scoped_release release;
@@ -183,7 +186,8 @@ Pulled backward_arrays(const SavedRendering& saved, const Input<float, 3>& d_rgb
     std::get<2>(out) = as_array(std::move(opacity_logits), {count});
   }
   if (want_means) std::get<3>(out) = as_array(std::move(means), {count, 3});
-  if (want_pose) std::get<4>(out).assign(gradients.pose, gradients.pose + 6);
+  if (want_weights) std::get<4>(out) = as_array(std::move(weights), {count});
+  if (want_pose) std::get<5>(out).assign(gradients.pose, gradients.pose + 6);
   return out;
 }
 
@@ -261,7 +265,7 @@ NB_MODULE(_native, m) {
         "rgb, depth_m, alpha and the record for backward. intrinsics: fx, fy, cx, cy; constants: low_pass_px2, near_m, "
         "alpha_cap, alpha_min, transmittance_min; threads 0: the default.");
   m.def("backward", &backward_arrays, "saved"_a, "d_rgb"_a, "d_depth"_a, "d_alpha"_a.none(), "want_attributes"_a,
-        "want_pose"_a, "want_means"_a, "threads"_a = 0,
+        "want_pose"_a, "want_means"_a, "want_weights"_a, "threads"_a = 0,
         "Derivatives by colours, log_radii, opacity_logits, means_m (None where not wanted) and pose (empty if not).");
   m.def("mapping_loss", &mapping_loss_arrays, "rgb"_a, "depth_m"_a, "target_rgb"_a, "target_depth_m"_a, "mask"_a.none(),
         "weight_color"_a, "weight_depth"_a, "ssim_share"_a, "threads"_a = 0,

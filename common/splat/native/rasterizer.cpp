@@ -192,10 +192,10 @@ void backward(const Rendering& r, const float* d_rgb, const float* d_depth, cons
       valid = false;
   });
   if (!valid) throw BadInput("an image derivative has a value that is not finite");
-  const ChainArgs args{r.view,         r.settings,           r.records.data(),     r.geometry_arrays(),
-                       r.rects.data(), r.slot_starts.data(), r.chunk_bases.data(), r.chunk_shift,
-                       slots.data(),   gradients.colors,     gradients.log_radii,  gradients.opacity_logits,
-                       gradients.means};
+  const ChainArgs args{r.view,          r.settings,           r.records.data(),     r.geometry_arrays(),
+                       r.rects.data(),  r.slot_starts.data(), r.chunk_bases.data(), r.chunk_shift,
+                       slots.data(),    gradients.colors,     gradients.log_radii,  gradients.opacity_logits,
+                       gradients.means, gradients.weights,    want_geometry};
   struct alignas(64) Partial {
     double pose[6];
   };

@@ -22,7 +22,8 @@ struct BadInput : std::runtime_error {
 };
 
 struct GradientArrays {
-  float *colors, *log_radii, *opacity_logits, *means;  // null where not wanted (the first three together)
+  // Null where not wanted; the first three together, and weights only with them.
+  float *colors, *log_radii, *opacity_logits, *means, *weights;
   double pose[6];
 };
 

@@ -102,7 +102,9 @@ struct ChainArgs {
   const uint32_t *slot_starts, *chunk_bases;
   int chunk_shift;
   const float* slots;
-  float *d_colors, *d_log_radii, *d_opacity_logits, *d_means;  // null where not wanted (the first three together)
+  // Null where not wanted; the first three together, and weights only with them.
+  float *d_colors, *d_log_radii, *d_opacity_logits, *d_means, *weights;
+  bool want_geometry;  // pose or means
 };
 
 struct LossArgs {
