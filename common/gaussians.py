@@ -66,8 +66,8 @@ class ViewTiedGaussians:
             **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
         )
 
-    def selected(self, rows: npt.NDArray[np.bool_]) -> "ViewTiedGaussians":
-        """The Gaussians where ``rows``, bool [N], is set, in the same order."""
+    def selected(self, rows: npt.NDArray[np.intp]) -> "ViewTiedGaussians":
+        """The Gaussians of ``rows``, indices [M]."""
         return ViewTiedGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def with_attributes(

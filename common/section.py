@@ -75,8 +75,8 @@ class Section:
             surface=np.concatenate([self.surface, self._surface_of(frame)]),
         )
 
-    def selected(self, rows: npt.NDArray[np.bool_]) -> "Section":
-        """The section with those of its Gaussians where ``rows``, bool [N], is set."""
+    def selected(self, rows: npt.NDArray[np.intp]) -> "Section":
+        """The section with the Gaussians of ``rows``, indices [M]."""
         return replace(self, gaussians=self.gaussians.selected(rows), means_m=self.means_m[rows])
 
     def with_surface_of(self, other: "Section") -> "Section":

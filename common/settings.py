@@ -189,6 +189,8 @@ class MapperSettings:
         seal_rate_first: Factor on the learning rates at the first of those ...
         seal_rate_last: ... and at the last, geometric in between.
         enough_loss: Steps on a frame end early once the last few losses (Eq. 2) lie below this; 0 never.
+        budget_s: Steps on a frame end once it has taken this long, tracking included; the map then depends on the
+            machine. 0 for no limit.
         learning_rate_color: Adam's rate of colours.
         learning_rate_log_radius: ... of log radii.
         learning_rate_opacity: ... of opacity logits.
@@ -221,6 +223,7 @@ class MapperSettings:
     seal_rate_first: Positive = 1.0
     seal_rate_last: Positive = 1.0
     enough_loss: NonNegative = 0.0
+    budget_s: NonNegative = 0.0
     learning_rate_color: NonNegative = 0.0025
     learning_rate_log_radius: NonNegative = 0.005
     learning_rate_opacity: NonNegative = 0.05

@@ -114,7 +114,7 @@ class System:
         engine: The rasteriser.
         archive: Where sealed sections go and come from.
         threads: Threads of the tracker's alignment.
-        clock: Seconds, for the times in `FrameReport`; nothing else depends on it.
+        clock: Seconds, for the times in `FrameReport` and for ``mapper.budget_s``; nothing else depends on it.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class System:
         else:
             T_world_camera = self._first_pose(prior) if tracking is None else tracking.T_world_camera
         tracked_s = self._clock()
-        active, commit = self._map(frame, T_world_camera, section_id, row)
+        active, commit = self._map(frame, T_world_camera, section_id, row, self._in_time(start_s))
         self.map.committed(active)
         self._state = self._state.after(
             frame, commit.T_world_camera, tracking, mean_depth_m(frame), exposure=commit.exposure
@@ -187,19 +187,39 @@ class System:
         return np.eye(4) if prior is None else prior.T_world_camera
 
     def _map(
-        self, frame: Frame, T_world_camera: npt.NDArray[np.float64], section_id: int, row: int
+        self,
+        frame: Frame,
+        T_world_camera: npt.NDArray[np.float64],
+        section_id: int,
+        row: int,
+        in_time: Callable[[], bool],
     ) -> tuple[ActiveSection, CommitRecord]:
         if row == 0:
             neighbours = self._head_neighbours(frame, T_world_camera, section_id)
             previous = self.map.section(section_id - 1) if section_id else None
             return self._mapper.map_head(
-                frame, T_world_camera, section_id=section_id, neighbours=neighbours, previous=previous
+                frame,
+                T_world_camera,
+                section_id=section_id,
+                neighbours=neighbours,
+                previous=previous,
+                in_time=in_time,
             )
         active = self.map.active
         assert active is not None
         return self._mapper.map_regular(
-            frame, T_world_camera, active, neighbours=self._neighbours(active), held_out=self._held_out(row)
+            frame,
+            T_world_camera,
+            active,
+            neighbours=self._neighbours(active),
+            held_out=self._held_out(row),
+            in_time=in_time,
         )
+
+    def _in_time(self, start_s: float) -> Callable[[], bool]:
+        """Whether a frame begun at ``start_s`` may still take steps (``mapper.budget_s``)."""
+        budget_s = self.settings.mapper.budget_s
+        return lambda: budget_s == 0 or self._clock() - start_s < budget_s
 
     def _held_out(self, row: int) -> bool:
         return self.settings.holdout > 0 and row % self.settings.holdout == 0

@@ -49,8 +49,8 @@ class Adam:
         self.m = np.concatenate([self.m, added])
         self.v = np.concatenate([self.v, added])
 
-    def select(self, rows: npt.NDArray[np.bool_]) -> None:
-        """Keep the rows where ``rows``, bool [N], is set."""
+    def select(self, rows: npt.NDArray[np.intp]) -> None:
+        """Keep ``rows``, indices [M]."""
         self.m, self.v = self.m[rows], self.v[rows]
 
     def step(self, parameters: FloatArray, gradients: FloatArray, *, rate: float = 1.0) -> None:

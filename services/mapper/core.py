@@ -3,6 +3,7 @@
 Pure: no bus, clock or files. Random choices are keyed by (seed, frame), so a restart repeats them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +41,7 @@ class Mapper:
         section_id: int,
         neighbours: list[Section],
         previous: Section | None = None,
+        in_time: Callable[[], bool] = lambda: True,
     ) -> tuple[ActiveSection, CommitRecord]:
         """Open a section at its head: a Gaussian at every pixel with depth, optimised with its neighbours (Eq. 2).
 
@@ -49,6 +51,7 @@ class Mapper:
             section_id: The new section.
             neighbours: The previous and the overlapping section, without repetition; empty for section 0.
             previous: The previous section, which the head's exposure is measured by; None for section 0.
+            in_time: Whether there is time for another step; asked from the second one on.
         """
         exposure = self._head_exposure(frame, T_world_camera, previous)
         section = Section(
@@ -67,7 +70,7 @@ class Mapper:
         bundle = HeadBundle(T_world_camera, self.settings)
         if section.gaussians.count:
             for step in range(self.settings.iterations_head):
-                if optimiser.good_enough():
+                if optimiser.good_enough() or (step and not in_time()):
                     break
                 pose_gradient = optimiser.step(view, with_neighbours=True, drop_hidden=step == 0)
                 optimiser.move_anchor(bundle.moved(pose_gradient))
@@ -89,6 +92,7 @@ class Mapper:
         *,
         neighbours: list[Section],
         held_out: bool = False,
+        in_time: Callable[[], bool] = lambda: True,
     ) -> tuple[ActiveSection, CommitRecord]:
         """Complement the section where it does not cover the frame, and optimise it on random views of its own.
 
@@ -98,6 +102,7 @@ class Mapper:
             active: The section so far.
             neighbours: The sections named by ``active.neighbour_ids``.
             held_out: Record the pose only: add nothing, learn nothing from it.
+            in_time: Whether there is time for another step; asked from the second one on.
         """
         row = len(active.section.frames)
         T_section_frame = active.section.T_section_camera(T_world_camera)
@@ -116,7 +121,14 @@ class Mapper:
         if new.count and self.settings.least_weight > 0:
             chosen[:1] = len(views) - 1  # its own view first: it shows which of the new ones are hidden
         result = self._optimised(
-            section, neighbours, active, views, chosen, rates=np.ones(chosen.size), drop_hidden=new.count > 0
+            section,
+            neighbours,
+            active,
+            views,
+            chosen,
+            rates=np.ones(chosen.size),
+            drop_hidden=new.count > 0,
+            in_time=in_time,
         )
         grown = ActiveSection(
             section=result.section, views=views, neighbour_ids=active.neighbour_ids, moments=result.moments
@@ -152,12 +164,13 @@ class Mapper:
         *,
         rates: npt.NDArray[np.float64],
         drop_hidden: bool = False,
+        in_time: Callable[[], bool] = lambda: True,
     ) -> Optimised:
         """The section after a step on each of the chosen views; at the first one hidden Gaussians may be dropped."""
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
             for step, (index, rate) in enumerate(zip(chosen, rates, strict=True)):
-                if optimiser.good_enough():
+                if optimiser.good_enough() or (step and not in_time()):
                     break
                 # The head alone is shared with the neighbours (docs/method.md, 3.3).
                 optimiser.step(

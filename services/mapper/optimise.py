@@ -119,7 +119,7 @@ class SectionOptimiser:
         if want_weights:
             assert gradients.weights is not None
             tied_to_view = self._section.gaussians.frame_index == view.frame_index
-            self._keep(~tied_to_view | (gradients.weights >= self._settings.least_weight))
+            self._keep(np.flatnonzero(~tied_to_view | (gradients.weights >= self._settings.least_weight)))
         return pose_gradient
 
     def _move(
@@ -136,8 +136,10 @@ class SectionOptimiser:
         if self._settings.radius_limit > 0:
             np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
 
-    def _keep(self, rows: npt.NDArray[np.bool_]) -> None:
-        """Leave out all Gaussians but those of ``rows``, bool [N]."""
+    def _keep(self, rows: npt.NDArray[np.intp]) -> None:
+        """Leave out all Gaussians but those of ``rows``."""
+        if rows.size == self._log_radii.size:
+            return
         self._section = self._section.selected(rows)
         self._colors, self._log_radii = self._colors[rows], self._log_radii[rows]
         self._opacity_logits = self._opacity_logits[rows]
