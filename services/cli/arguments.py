@@ -92,11 +92,13 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     track = kinds.add_parser("track", help="tracking on a recording, beside OpenCV's RGB-D odometry")
     mapping = kinds.add_parser("map", help="mapping alone, at the recording's true poses")
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
-    for kind in (track, mapping, system):
+    basin = kinds.add_parser("basin", help="how far off a first guess of the pose may be, for both optimisers")
+    basin.add_argument("--trials", type=int, default=30, metavar="N", help="guesses per error (default: %(default)s)")
+    for kind in (track, mapping, system, basin):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, track, mapping, system):
+    for kind in (splat, track, mapping, system, basin):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

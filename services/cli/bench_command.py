@@ -5,12 +5,13 @@ from argparse import Namespace
 from pathlib import Path
 
 from vtslam.common.config import ConfigError
+from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.run_command import assignments_of
-from vtslam.services.run_plan import plan_run
+from vtslam.services.run_plan import RunPlan, plan_run
 
 _LARGEST_SIDE_PX = 16384
 _OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system}
@@ -24,7 +25,7 @@ def bench_command(args: Namespace) -> int:
         raise ConfigError(
             f"--compare {args.compare}: expected a result of bench {args.bench}, found {earlier['bench']}"
         )
-    values = _splat(args) if args.bench == "splat" else _recording(args)
+    values = {"splat": _splat, "basin": _basin}.get(args.bench, _recording)(args)
     console.print(comparison_table(values, earlier))
     about = surroundings(["vtslam", *sys.argv[1:]])
     console.result({"bench": args.bench, **values, "about": about})
@@ -40,11 +41,22 @@ def _splat(args: Namespace) -> dict[str, object]:
         return bench_splat(_size(args.size), threads=args.threads, repeats=args.repeats, on_step=progress.step)
 
 
+def _basin(args: Namespace) -> dict[str, object]:
+    if args.trials < 1:
+        raise ConfigError(f"bench basin: expected --trials of at least 1, found {args.trials}")
+    plan = _plan(args)
+    with Progress(2 * len(ERRORS_M_DEG) * args.trials, what="tracking", unit="guess") as progress:
+        return bench_basin(plan, trials=args.trials, on_step=progress.step)
+
+
 def _recording(args: Namespace) -> dict[str, object]:
-    plan = plan_run(
+    return _OF_RECORDINGS[args.bench](_plan(args))
+
+
+def _plan(args: Namespace) -> RunPlan:
+    return plan_run(
         args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
     )
-    return _OF_RECORDINGS[args.bench](plan)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -54,6 +54,24 @@ def test_track_stands_beside_opencv_on_the_same_frames(tmp_path: Path) -> None:
     assert values["lost"] == 0
 
 
+def test_small_errors_of_the_guess_are_mended_by_both_optimisers(tmp_path: Path) -> None:
+    values = bench(
+        "basin", "sim:room?frames=7", "--size", "64x48", "--trials", "2", "--set", "tracker.adam.iterations=30",
+        "--set", "tracker.adam.first_section_iterations=30", result=tmp_path / "basin.json",
+    )  # fmt: skip
+    assert values["trials"] == 2
+    for name in ("gauss_newton", "adam"):
+        shares = values[name]["found"]
+        assert list(shares) == ["1 cm, 0.5 deg", "2 cm, 1 deg", "5 cm, 2.5 deg", "10 cm, 5 deg"]
+        assert shares["1 cm, 0.5 deg"] == 1.0
+    assert values["gauss_newton"]["renders_per_frame"] < values["adam"]["renders_per_frame"] == 30
+
+
+def test_a_basin_needs_frames_to_map_and_to_track(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "basin", "sim:room?frames=5", "--size", "64x48"]) == 2
+    assert "expected at least 6 frames, found 5" in capsys.readouterr().err
+
+
 def test_map_is_done_at_the_true_poses(tmp_path: Path) -> None:
     values = bench("map", *SMALL, result=tmp_path / "map.json")
     assert values["renders_per_frame"]["track"] == 0
