@@ -123,7 +123,7 @@ class GaussNewtonSettings:
 
     Attributes:
         renders: Renders of a frame at most; each is aligned to the frame until that converges.
-        levels: Image pyramid levels; the coarsest is 2^(levels-1) times smaller.
+        levels: Image pyramid levels at most; the coarsest is 2^(levels-1) times smaller, but no less than 15 px.
         iterations: Steps per level at most.
         converged_m: A step smaller than this, in metres, ends a level ...
         converged_rad: ... if its rotation is smaller than this too.
@@ -137,7 +137,7 @@ class GaussNewtonSettings:
     """
 
     renders: PositiveCount = 3
-    levels: Annotated[int, Range(1, 6)] = 3
+    levels: Annotated[int, Range(1, 6)] = 5
     iterations: PositiveCount = 10
     converged_m: Positive = 1e-4
     converged_rad: Positive = 5e-5

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
+from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim.alignment import PosePrior, align, observed_frame, reference_view
 from vtslam.common.optim.pose_adam import PoseAdam
 from vtslam.common.optim.tracking_loss import Target, TrackingLoss, tracking_loss
@@ -17,6 +18,7 @@ from vtslam.common.splat.engine import Engine, Rendering
 from vtslam.services.tracker.state import UNKNOWN_VARIANCE
 
 _ADAPTIVE_SILHOUETTES = (0.990, 0.993, 0.995, 0.997, 0.999)
+_COARSEST_SIDE_PX = 15  # smaller images say nothing about a pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -187,7 +189,8 @@ class _GaussNewton:
     ) -> PoseEstimate:
         s = self._settings
         masked_depth = np.where(mask > 0, self._depth_m, np.float32(0))
-        observed = observed_frame(self._rgb, masked_depth, self._camera, s.levels)
+        levels = _pyramid_levels(s.levels, self._camera)
+        observed = observed_frame(self._rgb, masked_depth, self._camera, levels)
         target = Target(rgb=self._rgb, depth_m=self._depth_m, mask=mask)
         T, information, first, loss, spent = T_guess, np.zeros((6, 6)), None, None, 0
         for _ in range(renders):
@@ -201,7 +204,7 @@ class _GaussNewton:
                 depth_weight=self._weights.depth_weight,
             )
             first = first or loss
-            coarsest = s.levels - 1 if spent == 1 else 0
+            coarsest = levels - 1 if spent == 1 else 0
             reference = reference_view(
                 rendering,
                 self._camera,
@@ -238,6 +241,12 @@ class _GaussNewton:
         if self._prior is None:
             return None
         return self._prior.T_camera_map @ se3.inverse(T_camera_map), self._prior.information
+
+
+def _pyramid_levels(wanted: int, camera: Camera) -> int:
+    """Levels whose images have at least ``_COARSEST_SIDE_PX`` rows and columns; one at least."""
+    side = min(camera.width, camera.height)
+    return max(1, min(wanted, (side // _COARSEST_SIDE_PX).bit_length()))
 
 
 def _covariance(information: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
