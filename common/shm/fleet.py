@@ -1,0 +1,166 @@
+"""The folder of a fleet's shared memory, and what is swept of fleets that died (docs/protocol-shm.md, section 2)."""
+
+import json
+import os
+import re
+import shutil
+import stat
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from vtslam.common.shm.errors import DamagedBlock, FleetExists, SharedMemoryError
+from vtslam.common.shm.process_identity import boot_id, is_alive, own_identity
+
+SHARED_MEMORY = Path("/dev/shm")
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+_PREFIX = "vtslam-"
+_OWNER, _RING, _MAP = "owner", "ring", "map"
+_MAX_OWNER_BYTES = 65536
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetOwner:
+    """Who made a fleet's folder.
+
+    Attributes:
+        fleet: The fleet's name.
+        boot: Boot of the machine; shared memory does not outlive it.
+        identity: The owner, as `process_identity` has it.
+        run_folder: The run that the fleet writes; empty if none.
+    """
+
+    fleet: str
+    boot: str
+    identity: int
+    run_folder: str
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the owner is still there."""
+        return self.boot == boot_id() and is_alive(self.identity)
+
+
+class FleetFolder:
+    """Shared memory of one fleet; made with :meth:`create`, used by its processes through :meth:`open`.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, fleet: str, *, run_folder: str = "", base: Path = SHARED_MEMORY) -> "FleetFolder":
+        """Make the folder of a new fleet, owned by this process, or take over that of a fleet that died.
+
+        Blocks of a fleet that died stay, for the new one to go on with; :meth:`remove` first to begin anew.
+
+        Raises:
+            FleetExists: A living fleet has that name, or another user's.
+            ValueError: The name has other characters or lengths than allowed.
+        """
+        path = _path_of(fleet, base)
+        try:
+            path.mkdir(mode=0o700)
+        except FileExistsError as error:
+            _require_own(path)
+            owner = read_owner(path)
+            if owner is not None and owner.is_alive and owner.identity != own_identity():
+                raise FleetExists(f"{path}: a fleet of this name is running") from error
+        except OSError as error:
+            raise SharedMemoryError(f"{path}: cannot be made: {error.strerror}") from error
+        owner = FleetOwner(fleet=fleet, boot=boot_id(), identity=own_identity(), run_folder=run_folder)
+        new = path / f".new-{_OWNER}"
+        new.unlink(missing_ok=True)
+        fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        with os.fdopen(fd, "w") as file:
+            json.dump(asdict(owner), file)
+        new.rename(path / _OWNER)
+        return cls(path)
+
+    @classmethod
+    def open(cls, fleet: str, *, base: Path = SHARED_MEMORY) -> "FleetFolder":
+        """The folder of a fleet; raises SharedMemoryError if there is none of this user."""
+        path = _path_of(fleet, base)
+        _require_own(path)
+        return cls(path)
+
+    @property
+    def ring_path(self) -> Path:
+        """Where the frame ring is."""
+        return self.path / _RING
+
+    @property
+    def map_path(self) -> Path:
+        """Where the map store is."""
+        return self.path / _MAP
+
+    def remove(self) -> None:
+        """Delete the folder and all blocks; memory is freed when the last process has unmapped it."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def read_owner(path: Path) -> FleetOwner | None:
+    """The owner of a fleet's folder; None if it was never fully made. Raises DamagedBlock."""
+    try:
+        with open(path / _OWNER, "rb") as file:
+            data = file.read(_MAX_OWNER_BYTES)
+    except FileNotFoundError:
+        return None
+    try:
+        owner = FleetOwner(**json.loads(data))
+        kinds = (type(owner.fleet), type(owner.boot), type(owner.identity), type(owner.run_folder))
+        if kinds != (str, str, int, str) or owner.identity < 0:
+            raise ValueError(f"unexpected types {kinds}")
+    except (ValueError, TypeError) as error:
+        raise DamagedBlock(f"{path / _OWNER}: not the owner of a fleet: {error}") from error
+    return owner
+
+
+def sweep_dead_fleets(
+    *, base: Path = SHARED_MEMORY, keep: Callable[[FleetOwner], bool] = lambda owner: False
+) -> list[str]:
+    """Delete the folders of this user's fleets whose owner is dead; their names.
+
+    Args:
+        base: Where fleets have their folders.
+        keep: Asked for each dead fleet; true where a run folder wants to go on with its blocks. Fleets of another boot
+            and folders without a readable owner are not asked about: nothing can go on with them.
+    """
+    swept = []
+    for path in sorted(base.glob(f"{_PREFIX}*")):
+        if not _is_own(path) or not _NAME.fullmatch(path.name.removeprefix(_PREFIX)):
+            continue
+        try:
+            owner = read_owner(path)
+        except DamagedBlock:
+            owner = None
+        if owner is not None and (owner.is_alive or (owner.boot == boot_id() and keep(owner))):
+            continue
+        shutil.rmtree(path, ignore_errors=True)
+        swept.append(path.name.removeprefix(_PREFIX))
+    return swept
+
+
+def _path_of(fleet: str, base: Path) -> Path:
+    if not _NAME.fullmatch(fleet):
+        raise ValueError(f"a fleet's name is 1 to 40 letters, digits, '-' or '_'; got {fleet!r}")
+    return base / f"{_PREFIX}{fleet}"
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a folder, not a link to one, belongs to this user alone."""
+    try:
+        facts = path.lstat()
+    except FileNotFoundError:
+        return False
+    return stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.geteuid() and not facts.st_mode & 0o077
+
+
+def _require_own(path: Path) -> None:
+    if not path.is_symlink() and not path.exists():
+        raise SharedMemoryError(f"{path}: expected the folder of a fleet, found nothing")
+    if not _is_own(path):
+        raise FleetExists(f"{path}: expected a folder of this user with mode 0700, found something else")
