@@ -29,7 +29,14 @@ from vtslam.common.shm.section_columns import (
 CONTROL, APPENDED = "control", "appended"
 LEARNED_NAME = re.compile(r"learned-(\d+)")
 DESCRIPTION = np.dtype(
-    [*CAMERA_FIELDS, ("depth_factor", "<f8"), ("max_frames", "<u4"), ("max_gaussians", "<u8"), ("with_moments", "<u1")]
+    [
+        *CAMERA_FIELDS,
+        ("depth_factor", "<f8"),
+        ("max_frames", "<u4"),
+        ("max_gaussians", "<u8"),
+        ("with_moments", "<u1"),
+        ("kept", "<u1"),
+    ]
 )
 RECORD = np.dtype(
     [
@@ -66,7 +73,7 @@ def moments_name(number: int) -> str:
 def description_of(spec: ActiveSpec) -> npt.NDArray[Any]:
     """What the control page says of an active section."""
     camera = camera_fields(spec.section_id, spec.camera, spec.depth_scale_m)
-    rest = (spec.depth_factor, spec.max_frames, spec.max_gaussians, spec.with_moments)
+    rest = (spec.depth_factor, spec.max_frames, spec.max_gaussians, spec.with_moments, spec.kept_generations)
     return np.array([(*camera, *rest)], DESCRIPTION)
 
 
@@ -76,6 +83,7 @@ class ActiveLayout:
     Attributes:
         description: Record of `DESCRIPTION`.
         images: Layout of one frame's images.
+        kept: Newest generations that stay, pinned or not.
         appended, learned, moments: Layouts of the files.
     """
 
@@ -84,6 +92,7 @@ class ActiveLayout:
         self.camera = camera_of(description)
         self.images = ImageLayout(self.camera)
         self.max_frames, self.max_gaussians = int(description["max_frames"]), int(description["max_gaussians"])
+        self.kept = int(description["kept"])
         self.table_bytes = aligned(self.max_frames * ROW.itemsize)
         head = self.table_bytes + self.max_frames * self.images.frame_bytes
         self.appended = ColumnLayout(TIE_COLUMNS, self.max_gaussians, head_bytes=head)

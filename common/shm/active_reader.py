@@ -18,8 +18,8 @@ from vtslam.common.shm.active_layout import (
     moments_name,
     read_record,
 )
-from vtslam.common.shm.blocks import ControlPage, Kind, mapped, open_file
-from vtslam.common.shm.errors import SectionNotResident
+from vtslam.common.shm.blocks import ControlPage, Kind, State, mapped, open_file
+from vtslam.common.shm.errors import GenerationGone, SectionNotResident
 from vtslam.common.shm.pins import Pin
 from vtslam.common.shm.records import ActiveState, AttributeMoments, SectionMoments
 from vtslam.common.shm.section_columns import LEARNED_COLUMNS, TRAINED
@@ -51,20 +51,22 @@ class ActiveReader:
         """Generation of the last commit; 0 before the first."""
         return self._control.state.number
 
-    def pinned(self, *, with_moments: bool = False) -> "PinnedActive":
-        """The last commit, in place.
+    def pinned(self, generation: int | None = None, *, with_moments: bool = False) -> "PinnedActive":
+        """One commit, in place.
 
         Args:
+            generation: Which one; None for the last.
             with_moments: Optimiser state too. No pin protects it: for nobody but the writer.
 
         Raises:
             SectionNotResident: The block has left memory, or has no commit yet.
+            GenerationGone: Not one of the newest generations that the block keeps, or not there yet.
             NoFreePin: Too many readers.
         """
         pins = self._control.pins
         pin = Pin(pins, pins.claim())
         try:
-            state = self._control.pin_state(pin.entry)
+            state = self._pinned_state(pin.entry, generation)
             if state.number == 0:
                 raise SectionNotResident(f"{self._folder}: nothing was committed yet")
             name = learned_name(state.buffer)
@@ -75,6 +77,17 @@ class ActiveReader:
         except BaseException:
             pin.release()
             raise
+
+    def _pinned_state(self, entry: int, generation: int | None) -> State:
+        if generation is None:
+            return self._control.pin_state(entry)
+        state = self._control.pin_number(entry, generation, self._layout.kept)
+        if state is None:
+            raise GenerationGone(
+                f"{self._folder}: generation {generation} is not one of the {self._layout.kept} newest, "
+                f"the last is {self.generation}"
+            )
+        return state
 
     def frame(self, index: int) -> Frame:
         """The frame in a committed row, in place."""

@@ -29,7 +29,7 @@ from vtslam.common.shm.blocks import CONTROL_BYTES, ControlPage, Kind, State, ma
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.growing_file import Admission, GrowingFile
 from vtslam.common.shm.records import MAX_FACTS_BYTES, MAX_NEIGHBOURS, ActiveSpec, ActiveState, Commit, SectionMoments
-from vtslam.common.shm.section_columns import KEEPS_DEPTH, LEARNED_COLUMNS, TIE_COLUMNS, TRAINED, packed_rows
+from vtslam.common.shm.section_columns import LEARNED_COLUMNS, TIE_COLUMNS, TRAINED, packed_rows
 
 _MAX_FREE_BUFFERS = 1  # kept for the next commit; more are given back
 
@@ -139,6 +139,7 @@ class ActiveWriter:
         self._write_learned(learned, commit, moments_file)
         failpoints.reach("shm.commit.before_flip")
         new = State(epoch=self._state.epoch, number=self._state.number + 1, buffer=buffer)
+        self._control.remember(new)
         self._control.publish(self._state, new)
         failpoints.reach("shm.commit.after_flip")
         self._state, self._moments_file = new, moments_file
@@ -146,6 +147,13 @@ class ActiveWriter:
         self._trim()
         failpoints.reach("shm.commit.after_trim")
         return new.number
+
+    def drop_spares(self) -> None:
+        """Give back what only a further commit would need; that one takes it anew."""
+        for number in set(self._moments) - {self._moments_file}:
+            self._moments.pop(number).close()
+            (self._folder / moments_name(number)).unlink(missing_ok=True)
+        self._trim(keep=0)
 
     def require_current(self) -> None:
         """Raise StaleWriter if another process has taken over."""
@@ -216,9 +224,8 @@ class ActiveWriter:
     # --- writing ----------------------------------------------------------------------------------------------------
 
     def _spare_buffer(self) -> int:
-        """A buffer that the state does not name and nobody has pinned."""
-        pinned = self._control.pinned_buffers()
-        taken = pinned | ({self._state.buffer} if self._state.number else set())
+        """A buffer that no kept generation is in and nobody has pinned."""
+        taken = self._control.pinned_buffers() | self._kept_buffers()
         free = [buffer for buffer in sorted(self._learned) if buffer not in taken]
         # Pins hold at most as many buffers as there are pins, so the count has an end.
         return free[0] if free else next(buffer for buffer in range(256) if buffer not in taken)
@@ -287,22 +294,23 @@ class ActiveWriter:
         record["neighbour_ids"][0, : len(commit.neighbour_ids)] = commit.neighbour_ids
         write_record(file.area, record, commit.facts)
 
-    def _trim(self) -> None:
-        """Unlink buffers that nobody needs, but for a spare one."""
-        others = [buffer for buffer in learned_buffers(self._folder) if self._is_old(buffer)]
+    def _trim(self, *, keep: int = _MAX_FREE_BUFFERS) -> None:
+        """Unlink buffers that nobody needs, but for ``keep``."""
+        kept = self._kept_buffers()
+        others = [buffer for buffer in learned_buffers(self._folder) if buffer not in kept]
         if not others:
             return
         self._control.pins.reap()
         pinned = self._control.pinned_buffers()
         # Buffers of a former writer are not open here, and go first.
         free = sorted((b for b in others if b not in pinned), key=lambda b: (b in self._learned, -b))
-        for buffer in free[: max(len(free) - _MAX_FREE_BUFFERS, 0)]:
+        for buffer in free[: max(len(free) - keep, 0)]:
             (self._folder / learned_name(buffer)).unlink(missing_ok=True)
             if buffer in self._learned:
                 self._learned.pop(buffer).close()
 
-    def _is_old(self, buffer: int) -> bool:
-        return not (self._state.number and buffer == self._state.buffer)
+    def _kept_buffers(self) -> set[int]:
+        return self._control.kept_buffers(self._state.number, self._layout.kept)
 
 
 def _head_of(fd: int) -> npt.NDArray[np.uint8]:

@@ -25,6 +25,8 @@ MAX_PINS = 24
 _MAGIC = int.from_bytes(b"VTSLSHM1", "little")
 _DESCRIPTION_AT = 1024
 _FIRST_PIN_WORD = 16
+_FIRST_HISTORY_WORD, _HISTORY = 64, 8
+MAX_KEPT = _HISTORY // 2  # the word of the next number must not be that of a kept one
 _W_MAGIC, _W_VERSION, _W_KIND, _W_FILE_BYTES, _W_WRITER, _W_STATE, W_COUNTER_A, W_COUNTER_B, _W_PINS, _W_DESCRIPTION = (
     range(10)
 )
@@ -226,6 +228,20 @@ class ControlPage:
         if not self.words.compare_exchange(_W_STATE, former.word, new.word):
             raise StaleWriter(f"{self._path}: taken over by process {pid_of(self.writer)} in epoch {self.state.epoch}")
 
+    def remember(self, state: State) -> None:
+        """Note where a number is before it is published, for readers that want just that one."""
+        self.words.store(_FIRST_HISTORY_WORD + state.number % _HISTORY, state.word)
+
+    def remembered(self, number: int) -> State | None:
+        """Where a number is or was; None if that is not known any more."""
+        state = State.of(self.words.load(_FIRST_HISTORY_WORD + number % _HISTORY))
+        return state if number and state.number == number else None
+
+    def kept_buffers(self, number: int, kept: int) -> set[int]:
+        """Buffers of ``number`` and of those before it, ``kept`` in all."""
+        states = (self.remembered(n) for n in range(max(number - kept, 0) + 1, number + 1))
+        return {state.buffer for state in states if state}
+
     def take_over(self) -> State:
         """Become the writer: the state afterwards, with the next epoch.
 
@@ -233,9 +249,10 @@ class ControlPage:
             WriterAlive: The writer is another living process, or one took over at the same moment.
         """
         former = self.writer
-        if former != own_identity():
-            if is_alive(former) or not self.words.compare_exchange(_W_WRITER, former, own_identity()):
-                raise WriterAlive(f"{self._path}: still written by process {pid_of(self.writer)}")
+        if former != own_identity() and (
+            is_alive(former) or not self.words.compare_exchange(_W_WRITER, former, own_identity())
+        ):
+            raise WriterAlive(f"{self._path}: still written by process {pid_of(self.writer)}")
         state = self.state
         new = state._replace(epoch=(state.epoch + 1) % 2**16)
         self.publish(state, new)
@@ -245,9 +262,18 @@ class ControlPage:
         """Pin the state as it is now with a claimed entry of the pin table; returns it."""
         while True:  # ends: the writer changes the state between two looks only by a whole publish in between
             state = self.state
-            self.pins.set(entry, state.word)
+            self.pins.pin(entry, state.word)
             if self.state == state:
                 return state
+
+    def pin_number(self, entry: int, number: int, kept: int) -> State | None:
+        """Pin one number with a claimed entry, if the writer still keeps it as one of ``kept``; None otherwise."""
+        state = self.remembered(number)
+        if state is None:
+            return None
+        self.pins.pin(entry, state.word)
+        # Still kept now: whoever frees it later looks through the pins after this one was stored.
+        return state if 0 <= self.state.number - number < kept else None
 
     def pinned_buffers(self) -> set[int]:
         """Buffers that living or dead processes have pinned."""

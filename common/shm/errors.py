@@ -55,6 +55,10 @@ class RingFull(SharedMemoryError):
     """No slot of the ring came free in time."""
 
 
+class GenerationGone(SharedMemoryError):
+    """The generation is not one of those that the active section keeps, or is not there yet."""
+
+
 class SectionNotResident(SharedMemoryError):
     """The section is not in the map store."""
 

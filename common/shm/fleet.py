@@ -1,5 +1,6 @@
 """The folder of a fleet's shared memory, and what is swept of fleets that died (docs/protocol-shm.md, section 2)."""
 
+import errno
 import json
 import os
 import re
@@ -14,7 +15,9 @@ from vtslam.common.shm.process_identity import boot_id, is_alive, own_identity
 
 SHARED_MEMORY = Path("/dev/shm")
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+_HEX = re.compile("[0-9a-f]{1,16}")
 _PREFIX = "vtslam-"
+_NEW_PREFIX = ".vtslam-new-"  # then the maker's identity
 _OWNER, _RING, _MAP = "owner", "ring", "map"
 _MAX_OWNER_BYTES = 65536
 
@@ -62,22 +65,21 @@ class FleetFolder:
             ValueError: The name has other characters or lengths than allowed.
         """
         path = _path_of(fleet, base)
-        try:
-            path.mkdir(mode=0o700)
-        except FileExistsError as error:
-            _require_own(path)
-            owner = read_owner(path)
-            if owner is not None and owner.is_alive and owner.identity != own_identity():
-                raise FleetExists(f"{path}: a fleet of this name is running") from error
-        except OSError as error:
-            raise SharedMemoryError(f"{path}: cannot be made: {error.strerror}") from error
         owner = FleetOwner(fleet=fleet, boot=boot_id(), identity=own_identity(), run_folder=run_folder)
-        new = path / f".new-{_OWNER}"
-        new.unlink(missing_ok=True)
-        fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        with os.fdopen(fd, "w") as file:
-            json.dump(asdict(owner), file)
-        new.rename(path / _OWNER)
+        new = base / f"{_NEW_PREFIX}{own_identity():x}-{fleet}"
+        try:
+            new.mkdir(mode=0o700)
+            _write_owner(new, owner)
+            new.rename(path)  # a folder that is there keeps its place, unless it is empty
+        except OSError as error:
+            shutil.rmtree(new, ignore_errors=True)
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+                raise SharedMemoryError(f"{path}: cannot be made: {error.strerror}") from error
+            _require_own(path)
+            former = read_owner(path)
+            if former is not None and former.is_alive and former.identity != own_identity():
+                raise FleetExists(f"{path}: a fleet of this name is running") from error
+            _write_owner(path, owner)
         return cls(path)
 
     @classmethod
@@ -100,6 +102,15 @@ class FleetFolder:
     def remove(self) -> None:
         """Delete the folder and all blocks; memory is freed when the last process has unmapped it."""
         shutil.rmtree(self.path, ignore_errors=True)
+
+
+def _write_owner(folder: Path, owner: FleetOwner) -> None:
+    new = folder / f".new-{_OWNER}"
+    new.unlink(missing_ok=True)
+    fd = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    with os.fdopen(fd, "w") as file:
+        json.dump(asdict(owner), file)
+    new.rename(folder / _OWNER)
 
 
 def read_owner(path: Path) -> FleetOwner | None:
@@ -129,6 +140,10 @@ def sweep_dead_fleets(
         keep: Asked for each dead fleet; true where a run folder wants to go on with its blocks. Fleets of another boot
             and folders without a readable owner are not asked about: nothing can go on with them.
     """
+    for path in base.glob(f"{_NEW_PREFIX}*"):
+        maker = path.name.removeprefix(_NEW_PREFIX).partition("-")[0]
+        if _is_own(path) and _HEX.fullmatch(maker) and not is_alive(int(maker, 16)):
+            shutil.rmtree(path, ignore_errors=True)
     swept = []
     for path in sorted(base.glob(f"{_PREFIX}*")):
         if not _is_own(path) or not _NAME.fullmatch(path.name.removeprefix(_PREFIX)):

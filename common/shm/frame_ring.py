@@ -205,7 +205,7 @@ class FrameRingWriter(_Ring):
         return FrameDescriptor(slot=slot, sequence=new.number)
 
     def _claimed_slot(self, sequence: int, oldest_kept: int | None) -> int | None:
-        """A slot marked as being written, which nobody has pinned; of frames before ``oldest_kept`` if that is given."""
+        """A slot marked as being written, which nobody has pinned; holding a frame before ``oldest_kept``, if given."""
         order = sorted((self._area.slot_state(slot), slot) for slot in range(self.spec.slots))
         failpoints.reach("shm.ring.before_claim")
         for former, slot in order:
@@ -258,7 +258,7 @@ class FrameRingReader(_Ring):
         self._check(descriptor)
         pins = self._control.pins
         entry = pins.claim()
-        pins.set(entry, State(epoch=0, number=descriptor.sequence, buffer=descriptor.slot).word)
+        pins.pin(entry, State(epoch=0, number=descriptor.sequence, buffer=descriptor.slot).word)
         pin = Pin(pins, entry)
         try:
             self._require(descriptor)

@@ -90,9 +90,13 @@ class MapStore:
         """A sealed section in place; raises SectionNotResident, NoFreePin, DamagedBlock."""
         return PinnedSealed(self._path("sealed", section_id), verify=verify)
 
-    def pinned_active(self, section_id: int) -> PinnedActive:
-        """The last commit of the active section in place; raises SectionNotResident, NoFreePin, DamagedBlock."""
-        return self.active_reader(section_id).pinned()
+    def pinned_active(self, section_id: int, generation: int | None = None) -> PinnedActive:
+        """A commit of the active section in place, the last one if ``generation`` is None.
+
+        Raises:
+            SectionNotResident, GenerationGone, NoFreePin, DamagedBlock: See `ActiveReader`.
+        """
+        return self.active_reader(section_id).pinned(generation)
 
     def active_reader(self, section_id: int) -> ActiveReader:
         """The active section, mapped once for many pins; raises SectionNotResident, DamagedBlock."""
@@ -144,6 +148,7 @@ class MapStore:
         if section.section_id != writer.section_id or writer.num_frames != len(section.frames) or not section.frames:
             raise ValueError(f"{self._folder}: section {section.section_id} is not what was committed last")
         row, last = len(section.frames) - 1, writer.last_frame()
+        writer.drop_spares()
         failpoints.reach("shm.seal.before_write")
         sealed, tail = self._path("sealed", section.section_id), self._path("tail", section.section_id)
         new_sealed, new_tail = self._temporary("new", sealed), self._temporary("new", tail)

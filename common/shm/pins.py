@@ -31,7 +31,7 @@ class PinTable:
                 break
         raise NoFreePin(f"all {len(self)} pins are held, by processes {', '.join(map(str, self.holder_pids()))}")
 
-    def set(self, entry: int, value: int) -> None:
+    def pin(self, entry: int, value: int) -> None:
         """Pin ``value`` with a claimed entry."""
         self._words.store(entry + 1, value)
 

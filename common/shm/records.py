@@ -8,6 +8,7 @@ import numpy.typing as npt
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.section import Section
+from vtslam.common.shm.blocks import MAX_KEPT
 
 MAX_FACTS_BYTES = 60 * 1024
 MAX_NEIGHBOURS = 8
@@ -26,6 +27,7 @@ class ActiveSpec:
         max_gaussians: Gaussians at most: pixels of a frame times frames, times 5 with the edge supplement.
         with_moments: Whether optimiser state is kept.
         pins: Readers that may look at it at a time, at most 24.
+        kept_generations: How many of the newest generations can be pinned by number, 1 to 4.
 
     Raises:
         ValueError: A number is out of range.
@@ -39,8 +41,11 @@ class ActiveSpec:
     max_gaussians: int
     with_moments: bool
     pins: int = 8
+    kept_generations: int = 1
 
     def __post_init__(self) -> None:
+        if not 1 <= self.kept_generations <= MAX_KEPT:
+            raise ValueError(f"expected 1 to {MAX_KEPT} kept generations, got {self.kept_generations}")
         if not (self.section_id >= 0 and 1 <= self.max_frames <= 65536 and 1 <= self.max_gaussians < 2**40):
             raise ValueError(
                 "an active section needs an id of 0 or more, room for 1 to 65536 frames and for 1 to 2^40 Gaussians; "

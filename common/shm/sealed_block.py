@@ -107,7 +107,7 @@ def write_sealed(path: Path, section: Section, admit: Admission, *, pins: int) -
             into["view_index"][index] = row
             into["view_depth"][index] = depth
         failpoints.reach("shm.sealed.after_columns")
-        description["crc32"] = zlib.crc32(data)
+        description["crc32"] = zlib.crc32(data.data)
         size = CONTROL_BYTES + data_bytes
         ControlPage.write(path, fd, Kind.SEALED, file_bytes=size, pins=pins, description=description)
     finally:
@@ -141,10 +141,10 @@ class PinnedSealed:
             data = mapped(fd, control.file_bytes - CONTROL_BYTES, offset=CONTROL_BYTES, writable=False)
         finally:
             os.close(fd)
-        if verify and zlib.crc32(data) != description["crc32"]:
+        if verify and zlib.crc32(data.data) != description["crc32"]:
             raise DamagedBlock(f"{path}: the checksum of the columns does not fit")
         self._pin = Pin(control.pins, control.pins.claim())
-        control.pins.set(self._pin.entry, control.state.word)
+        control.pins.pin(self._pin.entry, control.state.word)
         self.section = _sealed_section(description, data)
 
     def release(self) -> None:
@@ -192,7 +192,7 @@ def write_tail(path: Path, section_id: int, frame_index: int, frame: Frame, fact
         data = mapped(fd, data_bytes, offset=CONTROL_BYTES, writable=True)
         images.write(data, 0, frame)
         data[images.frame_bytes : images.frame_bytes + len(facts)] = np.frombuffer(facts, np.uint8)
-        description["crc32"] = zlib.crc32(data)
+        description["crc32"] = zlib.crc32(data.data)
         size = CONTROL_BYTES + data_bytes
         ControlPage.write(path, fd, Kind.TAIL, file_bytes=size, pins=1, description=description)
     finally:
@@ -216,7 +216,7 @@ def read_tail(path: Path) -> LastCommit:
         data = mapped(fd, control.file_bytes - CONTROL_BYTES, offset=CONTROL_BYTES, writable=False).copy()
     finally:
         os.close(fd)
-    if zlib.crc32(data) != found["crc32"]:
+    if zlib.crc32(data.data) != found["crc32"]:
         raise DamagedBlock(f"{path}: the checksum of the last commit does not fit")
     camera = camera_of(found)
     images = ImageLayout(camera)
