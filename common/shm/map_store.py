@@ -201,13 +201,14 @@ class MapStore:
         path.unlink(missing_ok=True)
 
     def remove_leftovers(self) -> None:
-        """Remove what dead processes left half made or half deleted, and active blocks of sealed sections."""
+        """Remove what dead processes left half made or half deleted, active blocks of sealed sections, old tails."""
         for name in os.listdir(self._folder):
             leftover = _LEFTOVER.fullmatch(name)
             if leftover and not is_alive(int(leftover[1], 16)):
                 _delete(self._folder / name)
         for section_id in set(self._ids("active")) & set(self._ids("sealed")):
             self._remove(self._path("active", section_id))
+        self._remove_old_tails()
 
     # --- parts ------------------------------------------------------------------------------------------------------
 
