@@ -9,21 +9,21 @@ import signal
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from helpers.processes import source_environment
 
 
-def run_script(name: str, *arguments: str, timeout_s: float = 300.0) -> Any:  # noqa: ANN401
-    """Run ``tests/helpers/NAME.py`` with arguments; the JSON value it prints."""
+def run_script(name: str, *arguments: str, prefix: Sequence[str] = (), timeout_s: float = 120.0) -> Any:  # noqa: ANN401
+    """Run ``tests/helpers/NAME.py`` with arguments, perhaps by way of another command; the JSON value it prints."""
     folder = Path(__file__).resolve().parent
     environment = source_environment()
     environment["PYTHONPATH"] = os.pathsep.join([str(folder.parent), environment["PYTHONPATH"]])
     environment |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, str(folder / f"{name}.py"), *arguments],
+        [*prefix, sys.executable, str(folder / f"{name}.py"), *arguments],
         env=environment,
         capture_output=True,
         text=True,
