@@ -23,6 +23,7 @@ from helpers.shm_sections import (
     spec_of,
     state_bytes,
 )
+
 from vtslam.common import failpoints
 from vtslam.common.shm.active_writer import ActiveWriter
 from vtslam.common.shm.errors import SectionNotResident

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from helpers.shm_sections import SmallSection, frame_of, sealed_section, spec_of, state_bytes
+
 from vtslam.common.shm.errors import SharedMemoryFull
 from vtslam.common.shm.frame_ring import FrameRingWriter
 from vtslam.common.shm.map_store import MapStore
@@ -22,8 +23,7 @@ def main() -> None:
     try:
         FrameRingWriter.create(folder / "ring", RingSpec(width=640, height=480))
     except SharedMemoryFull as error:
-        refusals.append("ring")
-        assert error.wanted_bytes > error.free_bytes
+        refusals.append("ring" if error.wanted_bytes > error.free_bytes else "ring, though there was room")
     assert list(folder.iterdir()) == []
     store = MapStore(folder / "map", budget_bytes=1 << 30)
     store.put_sealed(sealed_section(SmallSection(section_id=0, rows=20_000), 1))

@@ -10,11 +10,13 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from helpers.forks import Progress, ended, forked, killed
 from helpers.shm_sections import SmallSection, frame_bytes, frame_of, shared_folder, spec_of
+
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.shm.active_layout import LEARNED_NAME
 from vtslam.common.shm.errors import FrameGone, GenerationGone
@@ -150,7 +152,7 @@ def _ring(folder: Path, *, waiting: bool) -> dict[str, int]:
     if waiting:
         deaths = _all_served(folder, write, [take_all], hold)
     else:
-        deaths = _all_served(folder, write, [lambda say, pin=pin: look(say, pin) for pin in (True, False, False)], hold)
+        deaths = _all_served(folder, write, [partial(look, pin=pin) for pin in (True, False, False)], hold)
     reader = FrameRingReader(path)
     return {"deaths": deaths, "published": reader.published, "lost": reader.lost}
 
@@ -209,7 +211,7 @@ def _store(folder: Path) -> dict[str, int]:
         _wait_for_stop(folder, stays)
         _check_generation(held.state)
 
-    deaths = _all_served(folder, write, [lambda say, behind=behind: look(say, behind) for behind in (0, 0, 1)], hold)
+    deaths = _all_served(folder, write, [partial(look, behind=behind) for behind in (0, 0, 1)], hold)
     buffers = [name for name in os.listdir(folder / "map" / "active-000001") if LEARNED_NAME.fullmatch(name)]
     return {"deaths": deaths, "generations": store.active_reader(1).generation, "buffers": len(buffers)}
 
