@@ -206,10 +206,10 @@ def _at_every_point(prefixes: tuple[str, ...], go_on: GoOn, check_end: Callable[
     return passages
 
 
-def _at_any_instruction(seed: int, rounds: int, go_on: GoOn, check_end: Callable[[Path], None]) -> int:
-    """Kills from outside, some reported steps after the start of each process; how many hit."""
+def _at_any_instruction(seed: int, wanted: int, go_on: GoOn, check_end: Callable[[Path], None]) -> int:
+    """Kills from outside, some reported steps after the start of each process, until so many hit; how many did."""
     choice, kills = random.Random(seed), 0
-    for _ in range(rounds):
+    while kills < wanted:
         with shared_folder() as folder:
             done, status = 0, -1
             while status != 0:
@@ -239,7 +239,7 @@ def main() -> None:
     if how == "points":
         print(json.dumps(_at_every_point(names, go_on, check_end)))
     else:
-        print(json.dumps(_at_any_instruction(int(sys.argv[3]), 6, go_on, check_end)))
+        print(json.dumps(_at_any_instruction(int(sys.argv[3]), 12, go_on, check_end)))
 
 
 if __name__ == "__main__":
