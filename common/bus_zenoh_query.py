@@ -21,10 +21,9 @@ _MAX_REFUSAL = 256  # bytes of a refusal that are shown
 
 def _accepted(kind: type[M], payload: zenoh.ZBytes | None, max_bytes: int) -> M:
     """The message of a payload; MessageError if it is refused."""
-    size = 0 if payload is None else len(payload)
-    if payload is None or size > max_bytes:
-        raise MessageError(Reason.TOO_LONG, "", expected=f"1 to {max_bytes} bytes", found=str(size))
-    return decode(kind, bytes(payload), max_bytes=max_bytes).message
+    if payload is not None and len(payload) > max_bytes:
+        raise MessageError(Reason.TOO_LONG, "", expected=f"at most {max_bytes} bytes", found=str(len(payload)))
+    return decode(kind, b"" if payload is None else bytes(payload), max_bytes=max_bytes).message
 
 
 class ZenohRequest(Generic[M, R]):
