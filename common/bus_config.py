@@ -13,7 +13,7 @@ from vtslam.common.fleet_folder import HUB_SOCKET
 Config = dict[str, Any]
 
 _LEASE_MS = 4000  # a session that is silent for so long is taken for dead
-_BLOCK_US = 60_000_000  # how long a message waits for a reader's socket; the lease ends it before
+_BLOCK_US = 1_000_000  # a full socket holds up all that goes through the hub; then its session is closed, and recovers
 
 
 def hub_config(folder: Path, fleet: str, access: NetworkAccess | None = None) -> Config:

@@ -2,7 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -64,3 +64,13 @@ def zenoh_backend() -> Iterator[ZenohBackend]:
             yield backend
         finally:
             backend.close()
+
+
+def keep_trying(bus: Bus, attempt: Callable[[], bool], *, timeout_s: float = 60.0) -> bool:
+    """Call ``attempt``, which may publish, again and again until it is true; False if it never is."""
+    deadline_ns = bus.clock.monotonic_ns() + int(timeout_s * 1e9)
+    while not attempt():
+        if bus.clock.monotonic_ns() >= deadline_ns:
+            return False
+        bus.wait(0.02)
+    return True

@@ -1,12 +1,12 @@
 """What services rely on, held against the bus between processes and its twin in memory alike."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
-from helpers.bus_backends import Backend, MemoryBackend, zenoh_backend
+from helpers.bus_backends import Backend, MemoryBackend, keep_trying, zenoh_backend
 from helpers.bus_messages import descriptor, status
 
-from vtslam.common.bus import Bus, BusError, NoReply
+from vtslam.common.bus import Bus, BusError, NoReply, Pending, Queryable, Request
 from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.messages import (
     Command,
@@ -50,9 +50,21 @@ def _read(bus: Bus, subscriber: Subscriber[FrameDescriptor], count: int) -> list
     return [each.message.frame_id for each in received if each is not None]
 
 
-def _wait(bus: Bus, condition: object) -> None:
-    assert callable(condition)
+def _wait(bus: Bus, condition: Callable[[], bool]) -> None:
     assert bus.until(lambda: condition() or None, timeout_s=PATIENCE_S)
+
+
+def _asked(
+    tracker: Bus, mapper: Bus, queryable: Queryable[SectionRequest, SectionReply], request: SectionRequest
+) -> tuple[Pending[SectionReply], Request[SectionRequest, SectionReply]]:
+    """A question that has arrived; asked again as long as the queryable is not known everywhere."""
+    for _ in range(100):
+        pending = tracker.ask(SECTION_LOAD, request, timeout_s=PATIENCE_S)
+        question = mapper.until(queryable.receive, timeout_s=0.2)
+        if question is not None:
+            assert question.message.section_id == request.section_id
+            return pending, question
+    raise AssertionError("no question arrived")
 
 
 class TestBus:
@@ -119,10 +131,9 @@ class TestBus:
         def heard() -> bool:
             tracker_status.publish(status("tracker"))
             mapper_status.publish(status("mapper"))
-            supervisor.wait(0.02)
             return one.waiting >= 2 and everyone.waiting >= 6
 
-        _wait(supervisor, heard)
+        assert keep_trying(supervisor, heard)
         services = set()
         while (received := everyone.receive()) is not None:
             services.add(received.message.service)
@@ -148,29 +159,17 @@ class TestBus:
         with pytest.raises(NoReply, match="section/load"):
             tracker.get(SECTION_LOAD, request, timeout_s=0.2)
         queryable = mapper.queryable(SECTION_LOAD)
-        pending = self._asked(tracker, mapper, queryable, request)
-        pending[1].reply(
-            SectionReply(section_id=4, outcome=LoadOutcome.RESIDENT, block="section-000004", generation=9)
-        )
-        reply = tracker.until(pending[0].poll, timeout_s=PATIENCE_S)
+        pending, question = _asked(tracker, mapper, queryable, request)
+        question.reply(SectionReply(section_id=4, outcome=LoadOutcome.RESIDENT, block="section-000004", generation=9))
+        reply = tracker.until(pending.poll, timeout_s=PATIENCE_S)
         assert reply is not None
         assert (reply.section_id, reply.block, reply.generation) == (4, "section-000004", 9)
-        pending = self._asked(tracker, mapper, queryable, request)
-        pending[1].refuse("not today")
+        pending, question = _asked(tracker, mapper, queryable, request)
+        question.refuse("not today")
         with pytest.raises(NoReply, match="refused: not today"):
-            tracker.until(pending[0].poll, timeout_s=PATIENCE_S)
+            tracker.until(pending.poll, timeout_s=PATIENCE_S)
         with pytest.raises(NoReply, match="section/load"):
             tracker.get(SECTION_LOAD, request, timeout_s=0.2)
-
-    @staticmethod
-    def _asked(tracker: Bus, mapper: Bus, queryable, request):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN205
-        for _ in range(100):
-            pending = tracker.ask(SECTION_LOAD, request, timeout_s=PATIENCE_S)
-            question = mapper.until(queryable.receive, timeout_s=0.2)
-            if question is not None:
-                assert question.message.section_id == 4
-                return pending, question
-        raise AssertionError("no question arrived")
 
     def test_open_questions_end_when_the_answering_side_closes(self, backend: Backend) -> None:
         tracker, mapper = backend.join(Role.TRACKER), backend.join(Role.MAPPER)
