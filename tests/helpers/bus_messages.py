@@ -37,8 +37,8 @@ E = TypeVar("E", bound=StrEnum)
 MAX_BYTES = 1 << 20
 
 
-def descriptor(frame_id: int, **changes: Any) -> FrameDescriptor:
-    values = {
+def descriptor(frame_id: int, **changes: object) -> FrameDescriptor:
+    values: dict[str, Any] = {
         "frame_id": frame_id,
         "capture_time_ns": 1_000 * frame_id,
         "slot": frame_id % 8,
@@ -50,7 +50,7 @@ def descriptor(frame_id: int, **changes: Any) -> FrameDescriptor:
     return FrameDescriptor(**values | changes)
 
 
-def status(service: str, **changes: Any) -> ServiceStatus:
+def status(service: str, **changes: object) -> ServiceStatus:
     values: dict[str, Any] = {
         "service": service,
         "pid": 7,
@@ -206,9 +206,7 @@ def _reply(rng: np.random.Generator) -> Message:
 
 def _status(rng: np.random.Generator) -> Message:
     counters = {f"frames.{i}": _id(rng) for i in range(int(rng.integers(0, 8)))}
-    return status(
-        "mapper", state=_one(rng, ServiceState), counters=counters, gauges={"map_mb": float(rng.normal())}
-    )
+    return status("mapper", state=_one(rng, ServiceState), counters=counters, gauges={"map_mb": float(rng.normal())})
 
 
 def _control(rng: np.random.Generator) -> Message:

@@ -13,7 +13,7 @@ from helpers.bus_messages import MAX_BYTES, RANDOM
 
 from vtslam.common.bus import Bus
 from vtslam.common.messages import Message, MessageError, SectionRequest, decode, encode
-from vtslam.common.topics import EVERY_SERVICE, QUERIES, SECTION_LOAD, TOPICS, Role, Topic
+from vtslam.common.topics import EVERY_SERVICE, QUERIES, SECTION_LOAD, TOPICS, QueryTopic, Role, Topic
 
 SEED = 20_26
 MESSAGES = 20_000
@@ -121,9 +121,7 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
         for topic in TOPICS
     }
     publishers = {
-        topic.suffix: writer.declare_publisher(
-            _key(topic, "mapper"), congestion_control=zenoh.CongestionControl.BLOCK
-        )
+        topic.suffix: writer.declare_publisher(_key(topic, "mapper"), congestion_control=zenoh.CongestionControl.BLOCK)
         for topic in TOPICS
     }
     assert reader.until(lambda: all(p.matching_status for p in publishers.values()) or None, timeout_s=PATIENCE_S)
@@ -156,7 +154,7 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
 
 
 @pytest.mark.parametrize("query", QUERIES, ids=lambda query: query.suffix)
-def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query: Any) -> None:
+def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query: QueryTopic[Any, Any]) -> None:
     print(f"seed {SEED}")
     rng = np.random.default_rng(SEED)
     mapper, writer = backend.join(Role.MAPPER), _raw_session(backend.join(Role.OBSERVER, "hostile"))

@@ -4,7 +4,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -17,8 +17,10 @@ from vtslam.common.bus import Bus, BusError, Member
 from vtslam.common.bus_access import LOCAL_USER, Login, NetworkAccess, TlsFiles, write_password_file
 from vtslam.common.bus_config import remote_member_config
 from vtslam.common.bus_zenoh import Hub, ZenohBus, join, join_by
-from vtslam.common.messages import Control, FramePixels, Odometry, TrackedPose, encode
+from vtslam.common.messages import Control, FramePixels, Message, Odometry, TrackedPose, encode
 from vtslam.common.topics import CONTROL, SENSOR_PIXELS, TRACKER_ODOMETRY, TRACKER_POSE, Role
+
+M = TypeVar("M", bound=Message)
 
 PATIENCE_S = 30.0
 FORGER = 666
@@ -54,8 +56,10 @@ def _raw(bus: Bus) -> zenoh.Session:
     return session
 
 
-def _random(kind: type[Any]) -> Any:
-    return RANDOM[kind](np.random.default_rng(0))
+def _random(kind: type[M]) -> M:
+    message = RANDOM[kind](np.random.default_rng(0))
+    assert isinstance(message, kind)
+    return message
 
 
 def _check_rights(own: tuple[Bus, Bus], camera: Bus, robot: Bus) -> None:
@@ -88,33 +92,46 @@ def _check_rights(own: tuple[Bus, Bus], camera: Bus, robot: Bus) -> None:
     assert hidden.traffic().arrived == 0
 
 
-def _forged(kind: type[Any]) -> bytes:
+def _forged(kind: type[Message]) -> bytes:
     return encode(_random(kind), origin=FORGER, sequence=0, publish_time_ns=1, max_bytes=8192)
 
 
 @contextmanager
 def _own(folder: Path, login: Login | None) -> Iterator[tuple[Bus, Bus]]:
     """Sessions of the fleet itself."""
-    with join(_member(Role.TRACKER), folder, login=login) as tracker:
-        with join(_member(Role.SUPERVISOR), folder, login=login) as supervisor:
-            yield tracker, supervisor
+    with (
+        join(_member(Role.TRACKER), folder, login=login) as tracker,
+        join(_member(Role.SUPERVISOR), folder, login=login) as supervisor,
+    ):
+        yield tracker, supervisor
 
 
-def test_a_password_is_needed_and_a_role_has_its_limits(folder: Path) -> None:
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_a_password_is_needed_and_a_role_has_its_limits(folder: Path, protocol: str) -> None:
     passwords = folder / "passwords"
     write_password_file(passwords, [OWN, CAMERA, ROBOT])
-    assert passwords.stat().st_mode & 0o077 == 0
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = f"{protocol}/127.0.0.1:{_free_port()}"
+    hub_tls = member_tls = None
+    if protocol == "tls":
+        authority = Authority(folder / "ca")
+        certificate, key = authority.issue("hub")
+        hub_tls = TlsFiles(authority=authority.certificate, certificate=certificate, key=key)
+        member_tls = TlsFiles(authority=authority.certificate)
     access = NetworkAccess(
         endpoint=endpoint,
         members={"camera": Role.REMOTE_SENSOR, "robot": Role.OBSERVER},
         password_file=passwords,
+        tls=hub_tls,
     )
+
+    def config(login: Login) -> dict[str, Any]:
+        return remote_member_config(endpoint, login=login, tls=member_tls)
+
     with Hub(folder / "run", "test", access):
         for wrong in (Login(user="camera", password="wrong password"), Login(user="nobody", password="a password")):
             with pytest.raises(BusError, match="Unable to connect"):
-                _remote(Role.REMOTE_SENSOR, remote_member_config(endpoint, login=wrong))
-        without = remote_member_config(endpoint, login=CAMERA)
+                _remote(Role.REMOTE_SENSOR, config(wrong))
+        without = config(CAMERA)
         del without["transport"]["auth"]
         with pytest.raises(BusError, match="Unable to connect"):
             _remote(Role.REMOTE_SENSOR, without)
@@ -122,8 +139,8 @@ def test_a_password_is_needed_and_a_role_has_its_limits(folder: Path) -> None:
             join(_member(Role.TRACKER), folder / "run", timeout_s=0.0)
         with (
             _own(folder / "run", OWN) as own,
-            _remote(Role.REMOTE_SENSOR, remote_member_config(endpoint, login=CAMERA), PATIENCE_S) as camera,
-            _remote(Role.OBSERVER, remote_member_config(endpoint, login=ROBOT), PATIENCE_S) as robot,
+            _remote(Role.REMOTE_SENSOR, config(CAMERA), PATIENCE_S) as camera,
+            _remote(Role.OBSERVER, config(ROBOT), PATIENCE_S) as robot,
         ):
             _check_rights(own, camera, robot)
 
@@ -149,9 +166,7 @@ def test_certificates_open_the_door_and_tell_who_comes(folder: Path) -> None:
         without = remote_member_config(endpoint, login=CAMERA, tls=TlsFiles(authority=authority.certificate))
         with pytest.raises(BusError, match="Unable to connect"):
             _remote(Role.REMOTE_SENSOR, without)
-        fooled = remote_member_config(
-            endpoint, login=CAMERA, tls=TlsFiles(authority=stranger.certificate)
-        )
+        fooled = remote_member_config(endpoint, login=CAMERA, tls=TlsFiles(authority=stranger.certificate))
         with pytest.raises(BusError, match="Unable to connect"):
             _remote(Role.REMOTE_SENSOR, fooled)
         camera_config = remote_member_config(endpoint, tls=files(authority, "camera"))

@@ -67,7 +67,7 @@ with join(Member(fleet="test", role=Role.TRACKER), Path(sys.argv[1])) as bus:
     bus.declare_alive()
     print("ready", flush=True)
     received = (bus.receive(frames, timeout_s=60.0) for _ in range(int(sys.argv[2])))
-    print(json.dumps([each and each.message.frame_id for each in received]), flush=True)
+    print(json.dumps([str(each and each.message.frame_id) for each in received]), flush=True)
 """
 
 
@@ -216,7 +216,7 @@ def test_a_reader_that_was_stopped_for_long_gets_all_it_missed(folder: Path) -> 
             reader.send_signal(signal.SIGCONT)
             assert keep_trying(supervisor, lambda: watcher.names() == {"tracker"})
             publisher.publish(descriptor(count - 1))
-            assert _line(reader) == list(range(count))
+            assert _line(reader) == [str(frame_id) for frame_id in range(count)]
 
 
 def test_a_process_that_does_not_close_its_session_still_ends(folder: Path) -> None:
@@ -225,13 +225,16 @@ def test_a_process_that_does_not_close_its_session_still_ends(folder: Path) -> N
 
 
 def test_the_supervisors_own_session_reaches_the_members(folder: Path) -> None:
-    with Hub(folder / "run", "test") as hub, hub.bus(Member(fleet="test", role=Role.SUPERVISOR)) as supervisor:
-        with join(Member(fleet="test", role=Role.MAPPER), folder / "run") as mapper:
-            heard = supervisor.subscriber(STATUS, service="mapper")
-            out = mapper.publisher(STATUS, service="mapper")
+    with (
+        Hub(folder / "run", "test") as hub,
+        hub.bus(Member(fleet="test", role=Role.SUPERVISOR)) as supervisor,
+        join(Member(fleet="test", role=Role.MAPPER), folder / "run") as mapper,
+    ):
+        heard = supervisor.subscriber(STATUS, service="mapper")
+        out = mapper.publisher(STATUS, service="mapper")
 
-            def beat() -> bool:
-                out.publish(status("mapper"))
-                return heard.traffic().accepted > 0
+        def beat() -> bool:
+            out.publish(status("mapper"))
+            return heard.traffic().accepted > 0
 
-            assert keep_trying(supervisor, beat)
+        assert keep_trying(supervisor, beat)

@@ -8,7 +8,15 @@ from helpers.bus_messages import descriptor, status
 
 from vtslam.common.bus import Bus, BusError, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld
-from vtslam.common.bus_schedule import Kills, KillAt, Schedule, ScriptedSchedule, SeededKills, SeededSchedule, try_schedules
+from vtslam.common.bus_schedule import (
+    KillAt,
+    Kills,
+    Schedule,
+    ScriptedSchedule,
+    SeededKills,
+    SeededSchedule,
+    try_schedules,
+)
 from vtslam.common.messages import LoadOutcome, SectionReply, SectionRequest, ServiceStatus
 from vtslam.common.topics import SECTION_LOAD, SENSOR_FRAME, STATUS, Role
 
@@ -233,15 +241,14 @@ def test_a_course_without_end_is_an_error(monkeypatch: pytest.MonkeyPatch) -> No
         world.run(timeout_s=10.0)
 
 
-def test_a_repeated_number_is_taken_once_and_a_gap_is_counted() -> None:
+def test_a_repeated_number_is_taken_once_and_a_gap_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     world = MemoryWorld(ScriptedSchedule())
     reader = world.join(_member(Role.OBSERVER))
     heard = reader.subscriber(STATUS, service="mapper")
     sent: list[bytes] = []
     out = world.join(_member(Role.MAPPER)).publisher(STATUS, service="mapper")
-    world.send("spy", "nothing", lambda: None)
-    other = world.join(_member(Role.RECORDER)).subscriber(STATUS, service="mapper")
-    other.arrived = sent.append  # type: ignore[method-assign]
+    spy = world.join(_member(Role.RECORDER)).subscriber(STATUS, service="mapper")
+    monkeypatch.setattr(spy, "arrived", sent.append)
     for i in range(4):
         out.publish(status("mapper", last_frame_id=i))
     assert world.run(timeout_s=1.0, done=lambda: len(sent) == 4 and heard.waiting == 4)

@@ -31,7 +31,7 @@ def test_a_folder_that_others_may_enter_is_refused() -> None:
         folder.mkdir()
         folder.chmod(0o755)
         for use in (lambda: make_fleet_folder(folder), lambda: join(OBSERVER, folder)):
-            with pytest.raises(FleetFolderError, match="expected mode 0700 and user .*, found mode 0755"):
+            with pytest.raises(FleetFolderError, match=r"expected mode 0700 and user .*, found mode 0755"):
                 use()
 
 

@@ -9,7 +9,8 @@ from vtslam.common.topics import CONTROL, EVERY_SERVICE, QUERIES, ROOT, SENSOR_F
 
 
 def test_every_topic_says_who_publishes_it_and_what_fits() -> None:
-    assert len({topic.suffix for topic in (*TOPICS, *QUERIES)}) == len(TOPICS) + len(QUERIES)
+    suffixes = [topic.suffix for topic in TOPICS] + [query.suffix for query in QUERIES]
+    assert len(set(suffixes)) == len(suffixes)
     for topic in TOPICS:
         assert topic.publishers
         assert topic.history >= 1
