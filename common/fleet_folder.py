@@ -54,3 +54,6 @@ def check_fleet_folder(folder: Path) -> None:
             f"{folder}: expected mode 0700 and user {os.getuid()}, "
             f"found mode {stat.S_IMODE(facts.st_mode):04o} and user {facts.st_uid}"
         )
+    above = folder.absolute().parent.stat()
+    if above.st_uid not in (0, os.getuid()) or (above.st_mode & 0o022 and not above.st_mode & stat.S_ISVTX):
+        raise FleetFolderError(f"{folder.parent}: others may rename what is in it; use a folder of your own")

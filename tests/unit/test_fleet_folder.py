@@ -35,6 +35,16 @@ def test_a_folder_that_others_may_enter_is_refused() -> None:
                 use()
 
 
+def test_a_folder_that_others_may_rename_is_refused() -> None:
+    with short_folder() as base:
+        (base / "open").mkdir()
+        (base / "open").chmod(0o777)
+        with pytest.raises(FleetFolderError, match="others may rename"):
+            make_fleet_folder(base / "open" / "run")
+        (base / "open").chmod(0o1777)
+        make_fleet_folder(base / "open" / "run")
+
+
 def test_links_files_and_missing_folders_are_refused() -> None:
     with short_folder() as base:
         (base / "real").mkdir(mode=0o700)
