@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
-from vtslam.common.bus_inbox import Received, Subscriber
+from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.bus_life import AliveWatcher
+from vtslam.common.bus_received import Received
 from vtslam.common.messages import Message
 from vtslam.common.topics import QueryTopic, Role, Topic, checked_name
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 from typing import Generic, TypeVar
 
 from vtslam.common.bus_life import AliveWatcher
+from vtslam.common.bus_order import Arrivals, Gap
+from vtslam.common.bus_received import Received
 from vtslam.common.messages import Message, MessageError, Reason, decode
 from vtslam.common.topics import Overflow, Topic
 
@@ -16,28 +18,11 @@ _MAX_ORIGINS = 256  # publishers whose sequence is followed; the ones silent lon
 _RATE_SAMPLES = 33  # arrivals that the rate is taken over
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Received(Generic[M]):
-    """A message that arrived.
-
-    Attributes:
-        message: The record.
-        origin: Its publisher; another start of the same service is another one.
-        sequence: Its number among the publisher's.
-        publish_time_ns: The publisher's wall clock.
-        arrival_time_ns: This session's monotonic clock.
-    """
-
-    message: M
-    origin: int
-    sequence: int
-    publish_time_ns: int
-    arrival_time_ns: int
-
-
 @dataclass(slots=True, kw_only=True)
 class Traffic:
-    """Counts of one subscriber; arrived = accepted + rejected + repeated, accepted = read + waiting + dropped + lost.
+    """Counts of one subscriber: arrived = accepted + rejected + repeated.
+
+    What is accepted is read, waiting, dropped, lost, or held back behind a gap.
 
     Attributes:
         arrived: All that came.
@@ -47,7 +32,7 @@ class Traffic:
         read: Those handed to the reader.
         dropped: Those replaced by newer ones, as the topic's rule says.
         lost: Those that found the queue full although the topic's rule keeps all.
-        missed: Gaps in the publishers' numbers.
+        missed: Gaps in the publishers' numbers that were not filled.
     """
 
     arrived: int = 0
@@ -93,6 +78,8 @@ class Subscriber(Generic[M]):
         watcher: Who lives.
         notify: Called after something was accepted.
         release: Called once, on closing.
+        ask_again: Asks a publisher for messages once more, without waiting for them; None where nothing gets lost on
+            the way or is not asked for again.
     """
 
     def __init__(
@@ -104,15 +91,16 @@ class Subscriber(Generic[M]):
         watcher: AliveWatcher,
         notify: Callable[[], None],
         release: Callable[[], None],
+        ask_again: Callable[[Gap], None] | None = None,
     ) -> None:
         self.topic = topic
         self._overflow = Overflow.NEWEST if newest_only else topic.overflow
         self._room = 1 if self._overflow is Overflow.NEWEST else topic.history
         self._monotonic_ns, self._watcher = monotonic_ns, watcher
-        self._notify, self._release = notify, release
+        self._notify, self._release, self._ask_again = notify, release, ask_again
         self._lock = threading.Lock()
         self._unread: deque[Received[M]] = deque()
-        self._next_sequence: OrderedDict[int, int] = OrderedDict()
+        self._publishers: OrderedDict[int, Arrivals[M]] = OrderedDict()
         self._arrivals_ns: deque[int] = deque(maxlen=_RATE_SAMPLES)
         self._traffic = Traffic()
         self._rejections: dict[str, int] = {}
@@ -136,13 +124,24 @@ class Subscriber(Generic[M]):
         )
         with self._lock:
             self._traffic.arrived += 1
-            if not self._is_new(received):
+            publisher = self._publisher_of(received)
+            if not publisher.is_new(received.sequence):
                 self._traffic.repeated += 1
                 return
             self._traffic.accepted += 1
             self._arrivals_ns.append(now_ns)
             self._valid = True
-            self._keep(received)
+            publisher.take(received, self._keep)
+            if publisher.ahead and (self._ask_again is None or publisher.is_hopeless(now_ns, room=self._room)):
+                self._traffic.missed += publisher.skip_gap(now_ns, self._keep)
+        self._notify()
+
+    def told(self, origin: int, oldest: int, newest: int) -> None:
+        """Take a publisher's word for the numbers that it keeps and can send again."""
+        with self._lock:
+            publisher = self._publishers.get(origin)
+            if publisher is not None and 0 <= oldest <= newest + 1:
+                self._traffic.missed += publisher.told(oldest, newest, self._monotonic_ns(), self._keep)
         self._notify()
 
     def refused(self, reason: Reason) -> None:
@@ -155,11 +154,18 @@ class Subscriber(Generic[M]):
 
     def receive(self) -> Received[M] | None:
         """The next message, or None; does not wait."""
+        self._close_gaps()
         with self._lock:
             if not self._unread:
                 return None
             self._traffic.read += 1
             return self._unread.popleft()
+
+    @property
+    def lacks(self) -> bool:
+        """Whether publishers should be asked for more; reading does so."""
+        with self._lock:
+            return self._ask_again is not None and any(each.lacks for each in self._publishers.values())
 
     @property
     def waiting(self) -> int:
@@ -209,17 +215,28 @@ class Subscriber(Generic[M]):
         span_ns = last_ns - first_ns + (silence_ns - period_ns if silence_ns > 2 * period_ns else 0.0)
         return count / max(span_ns * 1e-9, 1e-9)
 
-    def _is_new(self, received: Received[M]) -> bool:
-        expected = self._next_sequence.get(received.origin)
-        if expected is not None and received.sequence < expected:
-            return False
-        if expected is not None:
-            self._traffic.missed += received.sequence - expected
-        self._next_sequence[received.origin] = received.sequence + 1
-        self._next_sequence.move_to_end(received.origin)
-        if len(self._next_sequence) > _MAX_ORIGINS:
-            self._next_sequence.popitem(last=False)
-        return True
+    def _publisher_of(self, received: Received[M]) -> Arrivals[M]:
+        first = 0 if self._ask_again is not None else received.sequence
+        new: Arrivals[M] = Arrivals(expected=first, begun=self._ask_again is None)
+        publisher = self._publishers.setdefault(received.origin, new)
+        self._publishers.move_to_end(received.origin)
+        if len(self._publishers) > _MAX_ORIGINS:
+            self._publishers.popitem(last=False)
+        return publisher
+
+    def _close_gaps(self) -> None:
+        """Ask publishers for what is missing, or go on without it when that is in vain."""
+        if self._ask_again is None or not self.lacks:
+            return
+        gaps, now_ns = [], self._monotonic_ns()
+        with self._lock:
+            for origin, publisher in self._publishers.items():
+                if publisher.is_hopeless(now_ns, room=self._room):
+                    self._traffic.missed += publisher.skip_gap(now_ns, self._keep)
+                elif (gap := publisher.to_ask_for(origin, now_ns)) is not None:
+                    gaps.append(gap)
+        for gap in gaps:
+            self._ask_again(gap)
 
     def _keep(self, received: Received[M]) -> None:
         if len(self._unread) < self._room:

@@ -20,15 +20,18 @@ from vtslam.common.bus_access import Login, NetworkAccess
 from vtslam.common.bus_config import Config, hub_config, member_config
 from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.bus_life import AliveWatcher
+from vtslam.common.bus_order import Gap
+from vtslam.common.bus_zenoh_again import KeptMessages, ask_for
 from vtslam.common.bus_zenoh_query import ZenohPending, ZenohQueryable
 from vtslam.common.fleet_folder import HUB_SOCKET, check_fleet_folder, make_fleet_folder
 from vtslam.common.messages import Message, Reason, encode
-from vtslam.common.topics import Overflow, QueryTopic, Topic, alive_key
+from vtslam.common.topics import Overflow, QueryTopic, Topic, again_key, alive_key
 
 M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=Message)
 
 _HEARTBEAT_S = 0.1  # of lossless publishers after they published: readers learn that the last message was lost
+_LACK_S = 0.1  # waiting ends after so long while something has to be asked for again
 _SMALL_BYTES = 65536  # topics of longer messages do not jump the queue
 _RETRY_S = 0.05
 
@@ -138,6 +141,11 @@ class ZenohBus(Bus):
         """See `Bus`."""
         session, key = self._open_session(), topic.key(self.member.fleet, service)
         declared: list[_Declared] = []
+        lossless = topic.overflow is Overflow.LOSSLESS and not newest_only
+
+        def ask_again(gap: Gap) -> None:
+            ask_for(session, again_key(self.member.fleet, gap.origin), gap, take, subscriber.told)
+
         subscriber = Subscriber(
             topic,
             newest_only=newest_only,
@@ -145,6 +153,7 @@ class ZenohBus(Bus):
             watcher=self.watch_alive(),
             notify=self.notify,
             release=lambda: declared[0].close(),
+            ask_again=ask_again if lossless else None,
         )
 
         def take(sample: zenoh.Sample) -> None:
@@ -154,7 +163,7 @@ class ZenohBus(Bus):
                 subscriber.arrived(bytes(sample.payload))
 
         handler: handlers.Callback[zenoh.Sample] = handlers.Callback(take, indirect=False)
-        if topic.overflow is Overflow.LOSSLESS and not newest_only:
+        if lossless:
             history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.history)
             recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
             advanced = ext.declare_advanced_subscriber(session, key, handler, history=history, recovery=recovery)
@@ -211,8 +220,10 @@ class ZenohBus(Bus):
 
     def wait(self, timeout_s: float) -> bool:
         """See `Bus`."""
+        lacks = any(subscriber.lacks for subscriber in self._subscribers)
         with self._arrival:
-            came = self._arrival.wait_for(lambda: self._arrivals != self._seen, timeout_s)
+            limit_s = min(timeout_s, _LACK_S) if lacks else timeout_s
+            came = self._arrival.wait_for(lambda: self._arrivals != self._seen, limit_s) or limit_s < timeout_s
             self._seen = self._arrivals
             return came
 
@@ -273,15 +284,18 @@ class _Publisher(Generic[M]):
         congestion = zenoh.CongestionControl.BLOCK if keeps else zenoh.CongestionControl.DROP
         small = topic.max_bytes <= _SMALL_BYTES
         priority = zenoh.Priority.REAL_TIME if small else zenoh.Priority.DATA
+        self._kept: KeptMessages | None = None
         self._declared: ext.AdvancedPublisher | zenoh.Publisher | None
         if topic.overflow is Overflow.LOSSLESS:
+            self._kept = KeptMessages(session, again_key(bus.member.fleet, self._origin), topic.history)
+            replies = ext.RepliesConfig(congestion_control=congestion, priority=priority, express=small)
             self._declared = ext.declare_advanced_publisher(
                 session,
                 key,
                 congestion_control=congestion,
                 priority=priority,
                 express=small,
-                cache=ext.CacheConfig(topic.history),
+                cache=ext.CacheConfig(topic.history, replies_config=replies),
                 sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
                 publisher_detection=True,
             )
@@ -301,6 +315,8 @@ class _Publisher(Generic[M]):
                 publish_time_ns=self._bus.clock.wall_ns(),
                 max_bytes=self._topic.max_bytes,
             )
+            if self._kept is not None:
+                self._kept.add(self._sequence, data)
             try:
                 self._declared.put(data)
             except zenoh.ZError as error:
@@ -311,4 +327,6 @@ class _Publisher(Generic[M]):
     def close(self) -> None:
         with self._lock:
             declared, self._declared = self._declared, None
+        if self._kept is not None:
+            self._kept.close()
         _Declared(declared).close()

@@ -145,6 +145,11 @@ def alive_key(fleet: str, role: str, name: str, origin: str) -> str:
     return f"{ROOT}/{checked_name(fleet)}/alive/{role}/{name}/{origin}"
 
 
+def again_key(fleet: str, origin: int) -> str:
+    """The key to ask a lossless publisher at for messages once more."""
+    return f"{ROOT}/{checked_name(fleet)}/again/{origin}"
+
+
 def _by(*roles: Role) -> frozenset[Role]:
     return frozenset(roles)
 
