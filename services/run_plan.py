@@ -12,8 +12,10 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.engines import engine_versions, make_engine
+from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.process_facts import program_version, versions
-from vtslam.services.recording_run import FrameFacts, RunSummary, run_recording
+from vtslam.services.recording_run import run_recording
+from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import Source
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.storage.run_folder import RunFolder

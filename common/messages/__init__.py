@@ -13,6 +13,7 @@ from vtslam.common.messages.mapping import (
     SectionRequest,
     SectionSealed,
     TrackedPose,
+    TrackerHistory,
 )
 from vtslam.common.messages.rules import MessageError, Reason
 from vtslam.common.messages.running import Command, Control, ServiceState, ServiceStatus
@@ -42,6 +43,7 @@ __all__ = [
     "ServiceState",
     "ServiceStatus",
     "TrackedPose",
+    "TrackerHistory",
     "decode",
     "encode",
 ]

@@ -1,6 +1,6 @@
 """Messages of tracker, mapper and archiver: poses, commits, sections."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
@@ -14,13 +14,14 @@ from vtslam.common.messages.base import (
     Measure,
     Message,
     Name,
+    NonNegative,
     Note,
     OptionalId,
     Pose,
     Sha256,
     Switch,
 )
-from vtslam.common.messages.rules import COVARIANCE, Choice, Fields, Flag, Integer, Maybe, Numbers, Real
+from vtslam.common.messages.rules import COVARIANCE, Choice, Fields, Flag, Integer, Maybe, Numbers, Real, Series
 from vtslam.common.messages.rules import MAX_INT as _MAX
 
 _Covariance = Annotated[npt.NDArray[np.float64], COVARIANCE]
@@ -68,6 +69,39 @@ _QUALITY = Fields(
 )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackerHistory:
+    """What a tracker remembers of the frames so far; it is committed with the frame, so that it outlives the tracker.
+
+    Attributes:
+        color_losses, depth_losses_m: Losses of past frames, newest last, as many of one as of the other.
+        largest_mean_depths_m: The largest mean depths of frames, descending.
+
+    Raises:
+        ValueError: There are more losses of one kind than of the other.
+    """
+
+    color_losses: tuple[float, ...] = ()
+    depth_losses_m: tuple[float, ...] = ()
+    largest_mean_depths_m: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.color_losses) != len(self.depth_losses_m):
+            raise ValueError(f"{len(self.color_losses)} losses of colour, {len(self.depth_losses_m)} of depth")
+
+
+MAX_LOSSES = 200  # remembered
+MAX_MEAN_DEPTHS = 30
+_HISTORY = Fields(
+    TrackerHistory,
+    {
+        "color_losses": Series(MAX_LOSSES),
+        "depth_losses_m": Series(MAX_LOSSES),
+        "largest_mean_depths_m": Series(MAX_MEAN_DEPTHS),
+    },
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedPose(Message):
     """The pose that the tracker proposes for a frame.
@@ -82,6 +116,8 @@ class TrackedPose(Message):
         quality: What it rests on; None for a pose that was not tracked (the first frame's).
         state: Whether to trust it.
         overlap_section_id: For heads, the section it was tracked against; -1 otherwise.
+        history: What the tracker remembers once the frame is committed.
+        read_s, track_s: Seconds that reading the frame from its source and tracking it took.
     """
 
     KIND: ClassVar[str] = "tracked_pose"
@@ -99,6 +135,9 @@ class TrackedPose(Message):
     quality: Annotated[PoseQuality | None, Maybe(_QUALITY)]
     state: Annotated[PoseState, Choice(PoseState)]
     overlap_section_id: OptionalId
+    history: Annotated[TrackerHistory, _HISTORY] = field(default_factory=TrackerHistory)
+    read_s: NonNegative = 0.0
+    track_s: NonNegative = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

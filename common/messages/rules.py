@@ -193,6 +193,25 @@ class Numbers:
         return f"finite {self.dtype} {list(self.shape)}{self.meaning and ', ' + self.meaning}"
 
 
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A tuple of finite floats of a bounded length."""
+
+    max_length: int
+
+    def to_plain(self, value: Any, place: str) -> list[float]:  # noqa: ANN401
+        """See `Rule`."""
+        if type(value) is not tuple or len(value) > self.max_length:
+            raise refused(place, f"a tuple of at most {self.max_length} floats", value)
+        return [Real().to_plain(item, place) for item in value]
+
+    def from_plain(self, plain: Any, place: str) -> tuple[float, ...]:  # noqa: ANN401
+        """See `Rule`."""
+        if type(plain) is not list or len(plain) > self.max_length:
+            raise refused(place, f"at most {self.max_length} floats", plain)
+        return tuple(Real().from_plain(item, place) for item in plain)
+
+
 def _is_covariance(c: Any) -> bool:  # noqa: ANN401
     scale = float(np.abs(c).max())
     if not scale <= 1e12 or not np.allclose(c, c.T, atol=1e-9 * scale):

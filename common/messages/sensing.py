@@ -15,6 +15,7 @@ from vtslam.common.messages.base import (
     DepthScale,
     Message,
     Name,
+    NonNegative,
     OptionalId,
     Pixels,
     Pose,
@@ -45,6 +46,7 @@ class FrameDescriptor(Message):
         epoch: Of the sensor service; those of a fenced one are smaller.
         dropped_before: Frames that were dropped between this one and the one published before.
         condition: What is odd about it.
+        read_s: Seconds that reading it from its source took.
     """
 
     KIND: ClassVar[str] = "frame_descriptor"
@@ -59,6 +61,7 @@ class FrameDescriptor(Message):
     epoch: Count
     dropped_before: Count = 0
     condition: Annotated[FrameCondition, Choice(FrameCondition)] = FrameCondition.OK
+    read_s: NonNegative = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

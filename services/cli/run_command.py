@@ -9,8 +9,8 @@ from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
-from vtslam.services.recording_run import RunSummary
 from vtslam.services.run_plan import RunPlan, plan_run
+from vtslam.services.run_record import RunSummary
 
 
 def run_command(args: Namespace) -> int:

@@ -30,6 +30,7 @@ from vtslam.common.messages import (
     ServiceState,
     ServiceStatus,
     TrackedPose,
+    TrackerHistory,
 )
 
 E = TypeVar("E", bound=StrEnum)
@@ -132,6 +133,13 @@ def _tracked(rng: np.random.Generator) -> Message:
         quality=_quality(rng) if rng.integers(2) else None,
         state=_one(rng, PoseState),
         overlap_section_id=-1,
+        history=TrackerHistory(
+            color_losses=tuple(rng.uniform(size=4).tolist()),
+            depth_losses_m=tuple(rng.uniform(size=4).tolist()),
+            largest_mean_depths_m=tuple(rng.uniform(size=3).tolist()),
+        ),
+        read_s=float(rng.uniform()),
+        track_s=float(rng.uniform()),
     )
 
 
