@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vtslam.common.bus_access import Login, NetworkAccess, TlsFiles
-from vtslam.common.fleet_folder import HUB_SOCKET
+from vtslam.common.private_folder import HUB_SOCKET
 
 Config = dict[str, Any]
 

@@ -23,8 +23,8 @@ from vtslam.common.bus_life import AliveWatcher
 from vtslam.common.bus_order import Gap
 from vtslam.common.bus_zenoh_again import KeptMessages, ask_for
 from vtslam.common.bus_zenoh_query import ZenohPending, ZenohQueryable
-from vtslam.common.fleet_folder import HUB_SOCKET, check_fleet_folder, make_fleet_folder
 from vtslam.common.messages import Message, Reason, encode
+from vtslam.common.private_folder import HUB_SOCKET, check_private_folder, make_private_folder
 from vtslam.common.topics import Overflow, QueryTopic, Topic, again_key, alive_key
 
 M = TypeVar("M", bound=Message)
@@ -45,12 +45,12 @@ class Hub:
         access: How it is opened to other hosts; closed unless given.
 
     Raises:
-        FleetFolderError: The folder cannot be used.
+        PrivateFolderError: The folder cannot be used.
         BusError: Another hub is there, or it cannot listen.
     """
 
     def __init__(self, folder: Path, fleet: str, access: NetworkAccess | None = None) -> None:
-        make_fleet_folder(folder)
+        make_private_folder(folder)
         self.folder, self.fleet = folder, fleet
         self._session = _opened(hub_config(folder, fleet, access))
         (folder / HUB_SOCKET).chmod(0o600)
@@ -82,10 +82,10 @@ def join(member: Member, folder: Path, *, login: Login | None = None, timeout_s:
         timeout_s: How long to wait for the hub.
 
     Raises:
-        FleetFolderError: The folder is not there, or others could have tampered with it.
+        PrivateFolderError: The folder is not there, or others could have tampered with it.
         BusError: No hub took the connection within the time.
     """
-    check_fleet_folder(folder)
+    check_private_folder(folder)
     return join_by(member, member_config(folder, login), timeout_s=timeout_s)
 
 

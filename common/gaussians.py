@@ -66,6 +66,14 @@ class ViewTiedGaussians:
             **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
         )
 
+    def rows_from(self, first: int) -> "ViewTiedGaussians":
+        """The Gaussians from row ``first`` on."""
+        return ViewTiedGaussians(**{f.name: getattr(self, f.name)[first:] for f in fields(self)})
+
+    def copied(self) -> "ViewTiedGaussians":
+        """The same in memory of its own."""
+        return ViewTiedGaussians(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
     def with_attributes(
         self,
         *,

@@ -1,7 +1,7 @@
 """What is kept of one frame of a run, and how the steps of a frame add up to it."""
 
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -65,6 +65,41 @@ class FrameFacts:
             map_renders=self.map_renders + renders,
             map_s=self.map_s + seconds,
             total_s=self.total_s + seconds,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CommittedFrame:
+    """A committed frame.
+
+    Attributes:
+        facts: What is known of it.
+        capture_time_ns: Capture time.
+        T_world_camera: float64 [4,4], its committed pose.
+    """
+
+    facts: FrameFacts
+    capture_time_ns: int
+    T_world_camera: npt.NDArray[np.float64]
+
+    def as_plain(self) -> dict[str, Any]:
+        """The frame as values that JSON keeps exactly."""
+        return {
+            "facts": asdict(self.facts),
+            "capture_time_ns": self.capture_time_ns,
+            "T_world_camera": self.T_world_camera.tolist(),
+        }
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> "CommittedFrame":
+        """The frame of :meth:`as_plain`'s values."""
+        facts: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in plain["facts"].items()
+        }
+        return cls(
+            facts=FrameFacts(**facts),
+            capture_time_ns=plain["capture_time_ns"],
+            T_world_camera=np.array(plain["T_world_camera"], np.float64),
         )
 
 

@@ -10,9 +10,16 @@ import numpy.typing as npt
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.engines import thread_count
-from vtslam.services.frame_facts import FIRST_FRAME_STATE, KNOWN_STATE, FrameFacts, Seconds, frame_facts
+from vtslam.services.frame_facts import (
+    FIRST_FRAME_STATE,
+    KNOWN_STATE,
+    CommittedFrame,
+    FrameFacts,
+    Seconds,
+    frame_facts,
+)
 from vtslam.services.process_facts import peak_rss_mb
-from vtslam.services.run_record import CommittedFrame, RunRecord, RunSummary
+from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.services.sensor.sources.base import Source, SourceError
 from vtslam.services.system import FrameReport, System
 from vtslam.storage.run_folder import RunFolder

@@ -3,10 +3,9 @@
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from vtslam.common.trajectory_io import write_trajectory
-from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.frame_facts import CommittedFrame
 from vtslam.storage.run_folder import RunFolder
 
 
@@ -32,21 +31,6 @@ class RunSummary:
     interrupted: bool
     seconds: float
     peak_rss_mb: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CommittedFrame:
-    """A committed frame.
-
-    Attributes:
-        facts: What is known of it.
-        capture_time_ns: Capture time.
-        T_world_camera: float64 [4,4], its committed pose.
-    """
-
-    facts: FrameFacts
-    capture_time_ns: int
-    T_world_camera: npt.NDArray[np.float64]
 
 
 class RunRecord:

@@ -180,7 +180,7 @@ class FrameCommitted(Message):
         gaussians_added: New Gaussians tied to it.
         gaussians: Gaussians of the section afterwards.
         iterations: Optimiser steps spent.
-        renders: Renders spent.
+        renders: Renders spent, on ending the section too if the frame did.
         loss: Eq. 2 at the last step; 0 if there was none.
         held_out: Whether the frame was kept out of mapping.
         block: The section's block in the map store.

@@ -57,10 +57,14 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         commands,
         "run",
         "track and map a recording",
-        example="vtslam run replica:DIR --in-process --size 320x240 --frames 0:120 --out RUN",
+        example="vtslam run replica:DIR --size 320x240 --frames 0:120 --out RUN",
     )
     command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
-    command.add_argument("--in-process", action="store_true", help="run in this process; for now the only way")
+    command.add_argument(
+        "--in-process",
+        action="store_true",
+        help="one process for all services; the result is the same",
+    )
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_layers(command)
