@@ -1,22 +1,23 @@
 """Small recordings through a fleet and through one process, and what to compare of them."""
 
+import json
 import os
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+
+from helpers.recordings import ReplicaRecording, filled
 
 from vtslam.services.run_plan import RunPlan, plan_run
 from vtslam.services.run_record import RunSummary
+from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.supervisor import Supervisor
 
 FRAMES, SECTION = 20, 6
 _ASSIGNMENTS = (
     f"source.frames=0:{FRAMES}",
-    "source.size=64x48",
     f"section.length={SECTION}",
     "section.candidate_interval=3",
     "mapper.iterations_head=6",
@@ -28,8 +29,26 @@ _ASSIGNMENTS = (
 )
 
 
-def small_plan(*assignments: str) -> RunPlan:
-    return plan_run("sim:room?frames=60", assignments=[*_ASSIGNMENTS, *assignments])
+def write_small_recording(folder: Path) -> ReplicaRecording:
+    """Some frames of the simulated room as files, since the room takes a second to build at every start."""
+    source = open_source("sim:room?frames=60", size=(64, 48))
+    frames = [source.frame(index) for index in range(FRAMES)]
+    camera = {**source.camera.as_dict(), "scale": 1.0 / source.depth_scale_m}
+    poses = source.ground_truth()
+    assert poses is not None
+    recording = ReplicaRecording(
+        folder=folder, rgb=[f.rgb for f in frames], depth=[f.depth for f in frames], poses=poses[:FRAMES]
+    )
+    (folder / "results").mkdir(parents=True)
+    words = {"width": "w", "height": "h"}
+    (folder / "cam_params.json").write_text(
+        json.dumps({"camera": {words.get(key, key): value for key, value in camera.items()}})
+    )
+    return filled(recording)
+
+
+def small_plan(recording: ReplicaRecording, *assignments: str) -> RunPlan:
+    return plan_run(recording.uri, family="tum", assignments=[*_ASSIGNMENTS, *assignments])
 
 
 def result_bytes(run: Path) -> dict[str, bytes]:
@@ -38,12 +57,12 @@ def result_bytes(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in paths}
 
 
-@lru_cache(maxsize=1)
-def undisturbed() -> dict[str, bytes]:
-    """The result of the small recording in one process."""
-    with TemporaryDirectory() as folder:
-        small_plan().execute(Path(folder) / "run")
-        return result_bytes(Path(folder) / "run")
+@dataclass(frozen=True, slots=True)
+class SmallRecording:
+    """The recording, and the result of mapping it in one process."""
+
+    files: ReplicaRecording
+    undisturbed: dict[str, bytes]
 
 
 @dataclass(slots=True)
@@ -96,7 +115,11 @@ class Disturbance:
 
 
 def fleet_run(
-    out: Path, disturbance: Disturbance | None = None, *, should_stop: Callable[[], bool] = lambda: False
+    recording: ReplicaRecording,
+    out: Path,
+    disturbance: Disturbance | None = None,
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
     """The small recording through a fleet."""
-    return small_plan().execute_in_fleet(out, (disturbance or Disturbance()).hooks(should_stop))
+    return small_plan(recording).execute_in_fleet(out, (disturbance or Disturbance()).hooks(should_stop))
