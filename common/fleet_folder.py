@@ -146,6 +146,19 @@ def read_owner(path: Path) -> FleetOwner | None:
     return owner
 
 
+def running_fleets(*, base: Path = SHARED_MEMORY) -> list[str]:
+    """Names of this user's fleets whose owner lives."""
+    names = []
+    for path in sorted(base.glob(f"{_PREFIX}*")):
+        try:
+            owner = read_owner(path) if _is_own(path) else None
+        except DamagedBlock:
+            continue
+        if owner is not None and owner.is_alive:
+            names.append(owner.fleet)
+    return names
+
+
 def sweep_dead_fleets(
     *, base: Path = SHARED_MEMORY, keep: Callable[[FleetOwner], bool] = lambda owner: False
 ) -> list[str]:

@@ -18,6 +18,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
     _add_run(commands)
+    _add_status(commands)
     _add_eval(commands)
     _add_bench(commands)
     _add_settings(commands)
@@ -69,6 +70,14 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_layers(command)
     _add_source_shorthands(command)
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_status(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands, "status", "show the services of running fleets", example="vtslam status --fleet run-4711-a3f09c"
+    )
+    command.add_argument("--fleet", metavar="NAME", help="this fleet (default: all of this user)")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 

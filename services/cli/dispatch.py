@@ -45,6 +45,10 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.run_command import run_command
 
             return run_command(args)
+        case "status":
+            from vtslam.services.cli.status_command import status_command
+
+            return status_command(args)
         case "eval":
             from vtslam.services.cli.eval_command import eval_command
 
