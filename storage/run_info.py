@@ -27,7 +27,7 @@ class RunFacts:
         interrupted: It was asked to stop early, and kept what was done.
         frames: Frames committed so far.
         seconds: Wall-clock time of the run, reading and writing included.
-        peak_rss_mb: Largest resident memory of the process, 10^6 bytes.
+        peak_rss_mb: Largest resident memory of the process, or the sum over those of a fleet, 10^6 bytes.
     """
 
     created_by: str
