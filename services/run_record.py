@@ -20,8 +20,8 @@ class RunSummary:
         weak, lost: Frames in these states of tracking.
         interrupted: Whether it was asked to stop early.
         seconds: Wall-clock time, reading and writing included.
-        peak_rss_mb: Largest resident memory of the process, 10^6 bytes; of a fleet, the sum over its processes, in which
-            memory that they share counts for each.
+        peak_rss_mb: Largest resident memory of the process, 10^6 bytes; of a fleet, the sum over its processes, where
+            shared memory counts for each.
     """
 
     frames: int

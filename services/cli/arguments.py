@@ -93,7 +93,7 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command = _command(
         commands,
         "bench",
-        "measure rendering, tracking, mapping or the whole system on this machine",
+        "measure rendering, tracking, mapping or the whole system on this machine, or try a fleet's recovery",
         example="vtslam bench splat --size 640x480 --threads 2 --json FILE",
     )
     kinds = command.add_subparsers(dest="bench", metavar="WHAT", required=True)
@@ -105,11 +105,16 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     track = kinds.add_parser("track", help="tracking on a recording, beside OpenCV's RGB-D odometry")
     mapping = kinds.add_parser("map", help="mapping alone, at the recording's true poses")
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
-    for kind in (track, mapping, system):
-        kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    chaos = kinds.add_parser("chaos", help="a fleet whose processes are killed and stopped: is the result the same?")
+    chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
+    chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
+    chaos.add_argument("--seed", type=int, default=1, metavar="S", help="draws them (default: %(default)s)")
+    for kind in (track, mapping, system, chaos):
+        optional = {"nargs": "?", "default": "sim:room?frames=120&size=160x120"} if kind is chaos else {}
+        kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP, **optional)
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, track, mapping, system):
+    for kind in (splat, track, mapping, system, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

@@ -5,12 +5,13 @@ from argparse import Namespace
 from pathlib import Path
 
 from vtslam.common.config import ConfigError
+from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.run_command import assignments_of
-from vtslam.services.run_plan import plan_run
+from vtslam.services.run_plan import RunPlan, plan_run
 
 _LARGEST_SIDE_PX = 16384
 _OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system}
@@ -24,11 +25,17 @@ def bench_command(args: Namespace) -> int:
         raise ConfigError(
             f"--compare {args.compare}: expected a result of bench {args.bench}, found {earlier['bench']}"
         )
-    values = _splat(args) if args.bench == "splat" else _recording(args)
+    values = _measured(args)
     console.print(comparison_table(values, earlier))
     about = surroundings(["vtslam", *sys.argv[1:]])
     console.result({"bench": args.bench, **values, "about": about})
-    return 0
+    return 0 if args.bench != "chaos" or is_sound(values) else 1
+
+
+def _measured(args: Namespace) -> dict[str, object]:
+    if args.bench == "splat":
+        return _splat(args)
+    return _chaos(args) if args.bench == "chaos" else _recording(args)
 
 
 def _splat(args: Namespace) -> dict[str, object]:
@@ -40,11 +47,24 @@ def _splat(args: Namespace) -> dict[str, object]:
         return bench_splat(_size(args.size), threads=args.threads, repeats=args.repeats, on_step=progress.step)
 
 
+def _chaos(args: Namespace) -> dict[str, object]:
+    if args.kills < 0 or args.hangs < 0:
+        raise ConfigError(f"bench chaos: expected --kills and --hangs of at least 0, found {args.kills}, {args.hangs}")
+    plan = _plan(args)
+    with Progress(len(plan.source), what="mapping under fire", unit="frame") as progress:
+        return bench_chaos(
+            plan, kills=args.kills, hangs=args.hangs, seed=args.seed, on_frame=lambda facts: progress.step()
+        )
+
+
 def _recording(args: Namespace) -> dict[str, object]:
-    plan = plan_run(
+    return _OF_RECORDINGS[args.bench](_plan(args))
+
+
+def _plan(args: Namespace) -> RunPlan:
+    return plan_run(
         args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
     )
-    return _OF_RECORDINGS[args.bench](plan)
 
 
 def _size(text: str) -> tuple[int, int]:
