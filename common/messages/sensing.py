@@ -123,8 +123,8 @@ class Credit(Message):
     """How far a publisher of pixels may go: cumulative, so that a lost one is made good by the next.
 
     Attributes:
-        stream: The publisher's stream.
         acknowledged_frame_id: All frames up to this one are committed and need not be sent again; -1 for none.
+        next_frame_id: The frame that is wanted next.
         limit_frame_id: Frames up to this one may be sent; -1 for none.
         epoch: Of the sensor service.
     """
@@ -132,7 +132,7 @@ class Credit(Message):
     KIND: ClassVar[str] = "credit"
     VERSION: ClassVar[int] = 1
 
-    stream: Name
     acknowledged_frame_id: OptionalId
+    next_frame_id: Count
     limit_frame_id: OptionalId
     epoch: Count

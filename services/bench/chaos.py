@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from vtslam.common import failpoints
 from vtslam.common.fleet_folder import SHARED_MEMORY
@@ -113,7 +114,7 @@ class _Disturber:
 
 def bench_chaos(
     plan: RunPlan, *, kills: int, hangs: int, seed: int, on_frame: Callable[[FrameFacts], None]
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Run a recording in one process, then in a fleet under fire, and compare.
 
     Args:
@@ -146,7 +147,7 @@ def bench_chaos(
     }
 
 
-def is_sound(values: dict[str, object]) -> bool:
+def is_sound(values: dict[str, Any]) -> bool:
     """Whether nothing was lost, doubled, changed or left."""
     none = ("frames_missing", "frames_duplicated", "orphans", "shm_left")
     return values["identical"] is True and all(values[key] == 0 for key in none)

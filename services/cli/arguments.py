@@ -18,6 +18,8 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
     _add_run(commands)
+    _add_up(commands)
+    _add_publish(commands)
     _add_status(commands)
     _add_eval(commands)
     _add_bench(commands)
@@ -73,6 +75,33 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 
+def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "up",
+        "start a fleet that maps what publishers send it, until Ctrl-C",
+        example="vtslam up --fleet kitchen --out RUN",
+    )
+    command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
+    command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    _add_layers(command)
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_publish(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "publish",
+        "send a recording to a fleet, as a sensor would",
+        example="vtslam publish sim:room --size 160x120 --fleet kitchen",
+    )
+    command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--size", metavar="WxH", help="scale frames to this size")
+    command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+
+
 def _add_status(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command = _command(
         commands, "status", "show the services of running fleets", example="vtslam status --fleet run-4711-a3f09c"
@@ -109,9 +138,12 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
     chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
     chaos.add_argument("--seed", type=int, default=1, metavar="S", help="draws them (default: %(default)s)")
+    chaos.add_argument(
+        "source", nargs="?", default="sim:room?frames=120&size=160x120", metavar="SOURCE", help="default: %(default)s"
+    )
+    for kind in (track, mapping, system):
+        kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     for kind in (track, mapping, system, chaos):
-        optional = {"nargs": "?", "default": "sim:room?frames=120&size=160x120"} if kind is chaos else {}
-        kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP, **optional)
         _add_layers(kind)
         _add_source_shorthands(kind)
     for kind in (splat, track, mapping, system, chaos):

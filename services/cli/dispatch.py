@@ -45,6 +45,14 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.run_command import run_command
 
             return run_command(args)
+        case "up":
+            from vtslam.services.cli.live_commands import up_command
+
+            return up_command(args)
+        case "publish":
+            from vtslam.services.cli.live_commands import publish_command
+
+            return publish_command(args)
         case "status":
             from vtslam.services.cli.status_command import status_command
 

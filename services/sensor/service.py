@@ -8,14 +8,10 @@ from vtslam.common.frame import Frame
 from vtslam.common.messages import FrameDescriptor, ServiceState
 from vtslam.common.shm.frame_ring import FrameRingReader, FrameRingWriter
 from vtslam.common.shm.ring_layout import FrameDescriptor as RingDescriptor
-from vtslam.common.shm.ring_layout import RingSpec
 from vtslam.common.topics import MAPPER_COMMITTED, SENSOR_FRAME
+from vtslam.services.sensor.ring import CREDIT, make_ring
 from vtslam.services.sensor.sources.base import Source
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
-
-CREDIT = 2  # frames in the ring that are not committed: the one at work, and the next one ready
-_PINS = 4
-_SLOTS = _PINS + CREDIT
 
 
 class RecordingSensor:
@@ -81,8 +77,7 @@ def _open_ring(path: Path, source: Source) -> FrameRingWriter:
     """The fleet's ring, taken over from a sensor that died if there was one."""
     if path.exists():
         return FrameRingWriter.adopt(path)
-    camera = source.camera
-    return FrameRingWriter.create(path, RingSpec(width=camera.width, height=camera.height, slots=_SLOTS, pins=_PINS))
+    return make_ring(path, source.camera)
 
 
 def _timed(source: Source, index: int) -> tuple[Frame, float]:

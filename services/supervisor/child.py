@@ -89,9 +89,13 @@ def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
 
 
 def _sensor(parts: _Parts) -> "Steps":
+    from vtslam.services.sensor.live import LiveSensor
     from vtslam.services.sensor.service import RecordingSensor
     from vtslam.services.sensor.sources.registry import open_source
+    from vtslam.services.supervisor.processes import LIVE_SOURCE
 
+    if parts.source == LIVE_SOURCE:
+        return LiveSensor(parts.bus, parts.link, parts.folder.ring_path)
     return RecordingSensor(parts.bus, parts.link, open_source(parts.source), parts.folder.ring_path)
 
 

@@ -24,6 +24,8 @@ SENSOR = Process(name="sensor", role=Role.SENSOR, after=("mapper", "tracker"))
 TRACKER = Process(name="tracker", role=Role.TRACKER)
 MAPPER = Process(name="mapper", role=Role.MAPPER)
 
+LIVE_SOURCE = "live:"  # in run.toml: frames come from publishers
+
 PROCESSES = (MAPPER, TRACKER, SENSOR)
 
 

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from vtslam.services.frame_facts import FrameFacts
     from vtslam.services.recorded_run import RecordedRun
     from vtslam.services.run_record import RunSummary
+    from vtslam.services.sensor.publisher import FramePublisher
     from vtslam.services.sensor.sources.base import Source, SourceError
     from vtslam.services.sensor.sources.registry import open_source
     from vtslam.services.system import Archive, FrameReport, System
@@ -66,6 +67,7 @@ _HOMES = {
     "Engine": "common.splat.engine",
     "Frame": "common.frame",
     "FrameFacts": "services.frame_facts",
+    "FramePublisher": "services.sensor.publisher",
     "FrameReport": "services.system",
     "NativeEngine": "common.splat.native_engine",
     "RasterSettings": "common.splat.engine",
@@ -97,6 +99,7 @@ __all__ = [
     "Engine",
     "Frame",
     "FrameFacts",
+    "FramePublisher",
     "FrameReport",
     "NativeEngine",
     "RasterSettings",

@@ -105,7 +105,7 @@ def _prior(rng: np.random.Generator) -> Message:
 
 
 def _credit(rng: np.random.Generator) -> Message:
-    return Credit(stream="cam-0", acknowledged_frame_id=-1, limit_frame_id=_id(rng), epoch=_id(rng))
+    return Credit(acknowledged_frame_id=-1, next_frame_id=_id(rng), limit_frame_id=_id(rng), epoch=_id(rng))
 
 
 def _quality(rng: np.random.Generator) -> PoseQuality:

@@ -25,8 +25,13 @@ def wait_for(path: Path, process: "subprocess.Popen[str]") -> None:
 def start_run(out: Path, *mode: str) -> "subprocess.Popen[str]":
     """A long run of the simulated room, in a process."""
     words = ["run", "sim:room?frames=2000", *mode, "--size", "48x36", "--set", "section.length=3"]
+    return start_vtslam(*words, "--out", str(out))
+
+
+def start_vtslam(*words: str) -> "subprocess.Popen[str]":
+    """A command in a process, its output and errors in one pipe."""
     return subprocess.Popen(
-        [sys.executable, "-m", "vtslam.services.cli", *words, "--out", str(out)],
+        [sys.executable, "-m", "vtslam.services.cli", *words],
         env=source_environment(),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -16,7 +16,7 @@ from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.supervisor import Supervisor
 
 FRAMES, SECTION = 20, 6
-_ASSIGNMENTS = (
+ASSIGNMENTS = (
     f"source.frames=0:{FRAMES}",
     f"section.length={SECTION}",
     "section.candidate_interval=3",
@@ -48,7 +48,7 @@ def write_small_recording(folder: Path) -> ReplicaRecording:
 
 
 def small_plan(recording: ReplicaRecording, *assignments: str) -> RunPlan:
-    return plan_run(recording.uri, family="tum", assignments=[*_ASSIGNMENTS, *assignments])
+    return plan_run(recording.uri, family="tum", assignments=[*ASSIGNMENTS, *assignments])
 
 
 def result_bytes(run: Path) -> dict[str, bytes]:

@@ -42,7 +42,7 @@ def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
 
 
 def _credit(limit: int) -> Credit:
-    return Credit(stream="cam", acknowledged_frame_id=-1, limit_frame_id=limit, epoch=1)
+    return Credit(acknowledged_frame_id=-1, next_frame_id=0, limit_frame_id=limit, epoch=1)
 
 
 def _read(bus: Bus, subscriber: Subscriber[FrameDescriptor], count: int) -> list[int]:

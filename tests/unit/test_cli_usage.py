@@ -10,7 +10,7 @@ from helpers.processes import source_environment
 
 from vtslam.services.cli.__main__ import main
 
-COMMANDS = ("demo", "run", "status", "eval", "settings", "doctor")
+COMMANDS = ("demo", "run", "up", "publish", "status", "eval", "settings", "doctor")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
