@@ -1,7 +1,10 @@
 """A fleet of processes leaves what one process leaves, whichever of them dies and whenever."""
 
 import signal
+import socket
 from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import pytest
 from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
@@ -28,6 +31,31 @@ def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_
     with RunFolder.open(tmp_path / "run") as run:
         assert run.read_info().facts.finished
         assert [row["frame_id"] for row in run.read_frames()] == list(range(FRAMES))
+
+
+def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRecording, tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    calm, pages = Disturbance(signals=[(3, "tracker", KILL)]), []
+
+    def look() -> bool:
+        if calm.frames > SECTION and not pages:
+            with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as page:
+                pages.append(page.read().decode())
+        return False
+
+    plan = small_plan(small.files, f"fleet.metrics_port={port}")
+    plan.execute_in_fleet(tmp_path / "run", calm.hooks(look))
+
+    values = dict(line.rsplit(" ", 1) for line in pages[0].splitlines() if not line.startswith("#"))
+    assert float(values["vtslam_map_bytes"]) > 10_000
+    assert values['vtslam_service_deaths_total{service="tracker"}'] == "1"
+    assert values['vtslam_service_starts_total{service="mapper"}'] == "1"
+    committed = sum(int(n) for key, n in values.items() if key.startswith("vtslam_frames_committed_total"))
+    assert SECTION < committed == int(values['vtslam_frame_seconds_bucket{step="map",le="+Inf"}'])
+    with pytest.raises(URLError):
+        urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60)
 
 
 @pytest.mark.parametrize("name", ["mapper", "tracker", "sensor"])
