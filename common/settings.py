@@ -248,10 +248,12 @@ class FleetSettings:
     Attributes:
         map_budget_mb: Shared memory for the map, 10^6 bytes.
         hang_s: A process whose work loop is silent for so long is killed and started again; more than any step takes.
+        metrics_port: Where 127.0.0.1 answers Prometheus; 0 for nowhere.
     """
 
     map_budget_mb: Annotated[int, Range(16, 10**7)] = 4000
     hang_s: Annotated[float, Range(5.0, 86400.0)] = 300.0
+    metrics_port: Annotated[int, Range(0, 65535)] = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

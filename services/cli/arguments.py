@@ -134,6 +134,7 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     track = kinds.add_parser("track", help="tracking on a recording, beside OpenCV's RGB-D odometry")
     mapping = kinds.add_parser("map", help="mapping alone, at the recording's true poses")
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
+    fleet = kinds.add_parser("fleet", help="a run as processes, beside the same in one process")
     chaos = kinds.add_parser("chaos", help="a fleet whose processes are killed and stopped: is the result the same?")
     chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
     chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
@@ -141,12 +142,12 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     chaos.add_argument(
         "source", nargs="?", default="sim:room?frames=120&size=160x120", metavar="SOURCE", help="default: %(default)s"
     )
-    for kind in (track, mapping, system):
+    for kind in (track, mapping, system, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
-    for kind in (track, mapping, system, chaos):
+    for kind in (track, mapping, system, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, track, mapping, system, chaos):
+    for kind in (splat, track, mapping, system, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from vtslam.common.config import ConfigError
 from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
+from vtslam.services.bench.fleet import bench_fleet
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.cli.console import Console, Progress
@@ -14,7 +15,7 @@ from vtslam.services.cli.run_command import assignments_of
 from vtslam.services.run_plan import RunPlan, plan_run
 
 _LARGEST_SIDE_PX = 16384
-_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system}
+_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system, "fleet": bench_fleet}
 
 
 def bench_command(args: Namespace) -> int:

@@ -17,6 +17,7 @@ from vtslam.services.frame_journal import JournalReader
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
 from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
@@ -56,7 +57,7 @@ def run_in_fleet(
 
     Raises:
         SourceError: A frame cannot be read; what was done before it is kept.
-        FleetError: A process cannot be kept alive.
+        FleetError: A process cannot be kept alive, or the port for metrics is taken.
         SharedMemoryError, BusError, PrivateFolderError: Shared memory or bus cannot be set up.
         StorageError: The run folder cannot be written.
     """
@@ -65,7 +66,13 @@ def run_in_fleet(
     fleet = fleet or f"run-{os.getpid()}-{secrets.token_hex(3)}"
     folder = FleetFolder.create(fleet, run_folder=str(run.path.resolve()), base=base)
     try:
-        recorder = Recorder(run, map_store(folder, settings), JournalReader(folder.journal_path), hooks.on_frame)
+        store, metrics = map_store(folder, settings), FleetMetrics()
+
+        def on_frame(facts: FrameFacts) -> None:
+            metrics.observe(facts)
+            hooks.on_frame(facts)
+
+        recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
         with Hub(folder.path, fleet) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
             supervisor = Supervisor(
                 bus,
@@ -76,7 +83,8 @@ def run_in_fleet(
                 on_event=hooks.on_event,
                 environment=hooks.environment,
             )
-            interrupted = _supervised(supervisor, bus, hooks)
+            with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
+                interrupted = _supervised(supervisor, bus, hooks)
         children = supervisor.children.values()
         summary = recorder.finish(
             finished=not interrupted and supervisor.refusal is None,

@@ -37,7 +37,8 @@ def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRe
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    calm, pages = Disturbance(signals=[(3, "tracker", KILL)]), []
+    calm = Disturbance(signals=[(3, "tracker", KILL)])
+    pages: list[str] = []
 
     def look() -> bool:
         if calm.frames > SECTION and not pages:
