@@ -70,6 +70,14 @@ class ViewTiedGaussians:
         """The Gaussians of ``rows``, indices [M]."""
         return ViewTiedGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
+    def rows_from(self, first: int) -> "ViewTiedGaussians":
+        """The Gaussians from row ``first`` on."""
+        return ViewTiedGaussians(**{f.name: getattr(self, f.name)[first:] for f in fields(self)})
+
+    def copied(self) -> "ViewTiedGaussians":
+        """The same in memory of its own."""
+        return ViewTiedGaussians(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
     def with_attributes(
         self,
         *,

@@ -79,6 +79,16 @@ class Section:
         """The section with the Gaussians of ``rows``, indices [M]."""
         return replace(self, gaussians=self.gaussians.selected(rows), means_m=self.means_m[rows])
 
+    def continued(self, earlier: "Section") -> "Section":
+        """As :meth:`retied`, with the parts that a former state of the section already has taken from there."""
+        new_means = self._means_of(self.gaussians.rows_from(earlier.gaussians.count))
+        new_surface = [self._surface_of(frame) for frame in self.frames[len(earlier.frames) :]]
+        return replace(
+            self,
+            means_m=np.concatenate([earlier.means_m, new_means]),
+            surface=np.concatenate([earlier.surface, *new_surface]),
+        )
+
     def with_surface_of(self, other: "Section") -> "Section":
         """The section with another one's measured surface beside its own; itself if the other one is this one."""
         if other.section_id == self.section_id:

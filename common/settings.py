@@ -251,13 +251,28 @@ class MapperSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FleetSettings:
+    """The processes of a run; none of it changes results.
+
+    Attributes:
+        map_budget_mb: Shared memory for the map, 10^6 bytes.
+        hang_s: A process whose work loop is silent for so long is killed and started again; more than any step takes.
+        metrics_port: Where 127.0.0.1 answers Prometheus; 0 for nowhere.
+    """
+
+    map_budget_mb: Annotated[int, Range(16, 10**7)] = 4000
+    hang_s: Annotated[float, Range(5.0, 86400.0)] = 300.0
+    metrics_port: Annotated[int, Range(0, 65535)] = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """All settings of a run.
 
     Attributes:
         seed: Key of every random choice.
         holdout: Every so many regular frames one is tracked but kept out of mapping; 0 none.
-        source, splat, section, tracker, mapper: The parts.
+        source, splat, section, tracker, mapper, fleet: The parts.
     """
 
     seed: Annotated[int, Range(0, 2**31)] = 2
@@ -267,3 +282,4 @@ class Settings:
     section: SectionSettings = field(default_factory=SectionSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     mapper: MapperSettings = field(default_factory=MapperSettings)
+    fleet: FleetSettings = field(default_factory=FleetSettings)

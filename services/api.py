@@ -4,9 +4,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from vtslam.services.evaluation import METRICS_NAME, evaluate_run, write_metrics
+from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.recorded_run import RecordedRun
-from vtslam.services.recording_run import FrameFacts, RunSummary
 from vtslam.services.run_plan import DEFAULT_PRESET, plan_run
+from vtslam.services.run_record import RunSummary
 
 
 def run(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,12 +13,17 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.engines import engine_versions, make_engine
+from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.process_facts import program_version, versions
-from vtslam.services.recording_run import FrameFacts, RunSummary, run_recording
+from vtslam.services.recording_run import run_recording
+from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import Source
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.run_info import RunFacts, RunInfo
+
+if TYPE_CHECKING:
+    from vtslam.services.supervisor.fleet_run import FleetHooks
 
 DEFAULT_PRESET = "fast"
 
@@ -73,6 +79,17 @@ class RunPlan:
                 on_frame=on_frame,
                 should_stop=should_stop,
             )
+
+    def execute_in_fleet(self, folder: Path, hooks: "FleetHooks", *, overwrite: bool = False) -> RunSummary:
+        """Make the run folder and run, each service a process of its own.
+
+        See :func:`vtslam.services.supervisor.fleet_run.run_in_fleet` for what may be raised, and StorageError: the
+        folder cannot be made.
+        """
+        from vtslam.services.supervisor.fleet_run import run_in_fleet
+
+        with RunFolder.create(folder, self._info(None), overwrite=overwrite) as run:
+            return run_in_fleet(run, self.settings, hooks)
 
     def _info(self, created_by: str | None) -> RunInfo:
         facts = RunFacts(

@@ -21,21 +21,21 @@ class RunFacts:
         created_by: Program and version.
         source: URI that opens the recording again.
         family, preset: Names of the settings layers.
-        width, height: Size of the images as mapped, pixels.
+        width, height: Size of the images as mapped, pixels; 0 while a live run knows none.
         first_frame, end_frame: The part of the source, from 0, its end not included.
         finished: The run came to its end; False while it is under way, and after it was cut off.
         interrupted: It was asked to stop early, and kept what was done.
         frames: Frames committed so far.
         seconds: Wall-clock time of the run, reading and writing included.
-        peak_rss_mb: Largest resident memory of the process, 10^6 bytes.
+        peak_rss_mb: Largest resident memory of the process, or the sum over those of a fleet, 10^6 bytes.
     """
 
     created_by: str
     source: str
     family: str
     preset: str
-    width: Annotated[int, Range(1)]
-    height: Annotated[int, Range(1)]
+    width: Annotated[int, Range(0)]
+    height: Annotated[int, Range(0)]
     first_frame: Annotated[int, Range(0)]
     end_frame: Annotated[int, Range(0)]
     finished: bool = False

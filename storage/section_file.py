@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.storage import plain_msgpack
+from vtslam.common import plain_msgpack
 from vtslam.storage.atomic import replace_file
 from vtslam.storage.errors import (
     BadMagic,
@@ -67,7 +67,7 @@ def write_columns(path: Path, header: Mapping[str, Any], columns: Mapping[str, A
 
     Args:
         path: The file; its folder must exist.
-        header: Plain values (see :mod:`vtslam.storage.plain_msgpack`), at most 65536 bytes packed.
+        header: Plain values (see :mod:`vtslam.common.plain_msgpack`), at most 65536 bytes packed.
         columns: Arrays of integer or float32/float64 type, at most 8 dimensions; names as in the format's section 1.
 
     Raises:

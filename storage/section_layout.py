@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vtslam.storage import plain_msgpack
+from vtslam.common import plain_msgpack
 from vtslam.storage.errors import ChecksumMismatch, MalformedSection, StorageError
 
 FORMAT_VERSION = 1

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.settings import OverlapSettings
@@ -32,6 +33,14 @@ class CandidateView:
     depth: npt.NDArray[np.uint16]
     depth_scale_m: float
     camera: Camera
+
+
+def world_points_m(
+    frame: Frame, T_world_camera: npt.NDArray[np.float64], mask: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.float64]:
+    """Back-projected pixels of ``mask`` in row order, float64 [N,3], world."""
+    points = frame.camera.back_projected(frame.depth_m())[mask].astype(np.float64)
+    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
 def seen_by_view(

@@ -16,7 +16,8 @@ from vtslam.common.geometry import se3
 from vtslam.common.section import Section
 from vtslam.services.engines import thread_count
 from vtslam.services.run_plan import RunPlan
-from vtslam.services.system import SectionMap, System
+from vtslam.services.section_map import SectionMap
+from vtslam.services.system import System
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.state import TrackerState
 

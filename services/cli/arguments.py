@@ -18,6 +18,9 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
     _add_run(commands)
+    _add_up(commands)
+    _add_publish(commands)
+    _add_status(commands)
     _add_eval(commands)
     _add_bench(commands)
     _add_settings(commands)
@@ -57,14 +60,53 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         commands,
         "run",
         "track and map a recording",
-        example="vtslam run replica:DIR --in-process --size 320x240 --frames 0:120 --out RUN",
+        example="vtslam run replica:DIR --size 320x240 --frames 0:120 --out RUN",
     )
     command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
-    command.add_argument("--in-process", action="store_true", help="run in this process; for now the only way")
+    command.add_argument(
+        "--in-process",
+        action="store_true",
+        help="one process for all services; the result is the same",
+    )
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_layers(command)
     _add_source_shorthands(command)
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "up",
+        "start a fleet that maps what publishers send it, until Ctrl-C",
+        example="vtslam up --fleet kitchen --out RUN",
+    )
+    command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
+    command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    _add_layers(command)
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_publish(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "publish",
+        "send a recording to a fleet, as a sensor would",
+        example="vtslam publish sim:room --size 160x120 --fleet kitchen",
+    )
+    command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--size", metavar="WxH", help="scale frames to this size")
+    command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+
+
+def _add_status(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands, "status", "show the services of running fleets", example="vtslam status --fleet run-4711-a3f09c"
+    )
+    command.add_argument("--fleet", metavar="NAME", help="this fleet (default: all of this user)")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 
@@ -80,7 +122,7 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command = _command(
         commands,
         "bench",
-        "measure rendering, tracking, mapping or the whole system on this machine",
+        "measure rendering, tracking, mapping or the whole system on this machine, or try a fleet's recovery",
         example="vtslam bench splat --size 640x480 --threads 2 --json FILE",
     )
     kinds = command.add_subparsers(dest="bench", metavar="WHAT", required=True)
@@ -94,11 +136,20 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
     basin = kinds.add_parser("basin", help="how far off a first guess of the pose may be, for both optimisers")
     basin.add_argument("--trials", type=int, default=30, metavar="N", help="guesses per error (default: %(default)s)")
-    for kind in (track, mapping, system, basin):
+    fleet = kinds.add_parser("fleet", help="a run as processes, beside the same in one process")
+    chaos = kinds.add_parser("chaos", help="a fleet whose processes are killed and stopped: is the result the same?")
+    chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
+    chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
+    chaos.add_argument("--seed", type=int, default=1, metavar="S", help="draws them (default: %(default)s)")
+    chaos.add_argument(
+        "source", nargs="?", default="sim:room?frames=120&size=160x120", metavar="SOURCE", help="default: %(default)s"
+    )
+    for kind in (track, mapping, system, basin, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    for kind in (track, mapping, system, basin, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, track, mapping, system, basin):
+    for kind in (splat, track, mapping, system, basin, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

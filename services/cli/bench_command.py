@@ -6,7 +6,9 @@ from pathlib import Path
 
 from vtslam.common.config import ConfigError
 from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
+from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
+from vtslam.services.bench.fleet import bench_fleet
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.cli.console import Console, Progress
@@ -14,7 +16,7 @@ from vtslam.services.cli.run_command import assignments_of
 from vtslam.services.run_plan import RunPlan, plan_run
 
 _LARGEST_SIDE_PX = 16384
-_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system}
+_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system, "fleet": bench_fleet}
 
 
 def bench_command(args: Namespace) -> int:
@@ -25,11 +27,15 @@ def bench_command(args: Namespace) -> int:
         raise ConfigError(
             f"--compare {args.compare}: expected a result of bench {args.bench}, found {earlier['bench']}"
         )
-    values = {"splat": _splat, "basin": _basin}.get(args.bench, _recording)(args)
+    values = _measured(args)
     console.print(comparison_table(values, earlier))
     about = surroundings(["vtslam", *sys.argv[1:]])
     console.result({"bench": args.bench, **values, "about": about})
-    return 0
+    return 0 if args.bench != "chaos" or is_sound(values) else 1
+
+
+def _measured(args: Namespace) -> dict[str, object]:
+    return {"splat": _splat, "basin": _basin, "chaos": _chaos}.get(args.bench, _recording)(args)
 
 
 def _splat(args: Namespace) -> dict[str, object]:
@@ -47,6 +53,16 @@ def _basin(args: Namespace) -> dict[str, object]:
     plan = _plan(args)
     with Progress(2 * len(ERRORS_M_DEG) * args.trials, what="tracking", unit="guess") as progress:
         return bench_basin(plan, trials=args.trials, on_step=progress.step)
+
+
+def _chaos(args: Namespace) -> dict[str, object]:
+    if args.kills < 0 or args.hangs < 0:
+        raise ConfigError(f"bench chaos: expected --kills and --hangs of at least 0, found {args.kills}, {args.hangs}")
+    plan = _plan(args)
+    with Progress(len(plan.source), what="mapping under fire", unit="frame") as progress:
+        return bench_chaos(
+            plan, kills=args.kills, hangs=args.hangs, seed=args.seed, on_frame=lambda facts: progress.step()
+        )
 
 
 def _recording(args: Namespace) -> dict[str, object]:

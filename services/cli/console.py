@@ -53,12 +53,12 @@ class Progress:
     """How far a command is: a bar with rate and time left on a terminal, else a plain line every few seconds.
 
     Args:
-        total: Steps in all.
+        total: Steps in all; None if nobody knows.
         what: What is under way, as in "mapping".
         unit: Name of a step.
     """
 
-    def __init__(self, total: int, *, what: str, unit: str) -> None:
+    def __init__(self, total: int | None, *, what: str, unit: str) -> None:
         self._total, self._what, self._unit, self._done = total, what, unit, 0
         self._start_s = self._last_line_s = time.monotonic()
         terminal = sys.stderr.isatty()
@@ -83,8 +83,13 @@ class Progress:
         if now_s - self._last_line_s >= _LINE_INTERVAL_S:
             self._last_line_s = now_s
             rate = self._done / (now_s - self._start_s)
-            left_s = (self._total - self._done) / rate
-            self.note(f"{self._what}: {self._done} of {self._total} {self._unit}s, {rate:.2f}/s, {left_s:.0f} s left")
+            self.note(f"{self._what}: {self._done}{self._of_total(rate)}")
+
+    def _of_total(self, rate: float) -> str:
+        if self._total is None:
+            return f" {self._unit}s, {rate:.2f}/s"
+        left_s = (self._total - self._done) / rate
+        return f" of {self._total} {self._unit}s, {rate:.2f}/s, {left_s:.0f} s left"
 
     def note(self, text: str) -> None:
         """A line that stays, beside the bar."""

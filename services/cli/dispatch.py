@@ -3,9 +3,13 @@
 import sys
 from argparse import Namespace
 
+from vtslam.common.bus import BusError
 from vtslam.common.config import ConfigError
+from vtslam.common.private_folder import PrivateFolderError
+from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.trajectory_io import TrajectoryError
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.errors import StorageError
 
 _FAILED, _USAGE = 1, 2
@@ -17,7 +21,15 @@ def execute(args: Namespace) -> int:
         return _command(args)
     except ConfigError as error:
         return _refused(error, _USAGE)
-    except (SourceError, StorageError, TrajectoryError) as error:
+    except (
+        SourceError,
+        StorageError,
+        TrajectoryError,
+        SharedMemoryError,
+        FleetError,
+        BusError,
+        PrivateFolderError,
+    ) as error:
         return _refused(error, _FAILED)
     except BrokenPipeError:
         return _FAILED  # the reader of our output is gone: nobody to tell
@@ -33,6 +45,18 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.run_command import run_command
 
             return run_command(args)
+        case "up":
+            from vtslam.services.cli.live_commands import up_command
+
+            return up_command(args)
+        case "publish":
+            from vtslam.services.cli.live_commands import publish_command
+
+            return publish_command(args)
+        case "status":
+            from vtslam.services.cli.status_command import status_command
+
+            return status_command(args)
         case "eval":
             from vtslam.services.cli.eval_command import eval_command
 

@@ -1,7 +1,7 @@
 """Follows a run for the person in front of it: progress, and a line whenever tracking is lost or found again."""
 
 from vtslam.services.cli.console import Progress
-from vtslam.services.recording_run import FrameFacts
+from vtslam.services.frame_facts import FrameFacts
 
 
 class FrameWatch:

@@ -5,25 +5,23 @@ from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
-from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
-from vtslam.services.recording_run import RunSummary
 from vtslam.services.run_plan import RunPlan, plan_run
+from vtslam.services.run_record import RunSummary
 
 
 def run_command(args: Namespace) -> int:
     """Run as the arguments say; the exit status."""
-    if not args.in_process:
-        raise ConfigError("run: add --in-process; running as separate processes is not available")
     console = Console(args.json)
     plan = plan_run(
         args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
     )
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
-        summary = watched_run(plan, args.out, stop, overwrite=args.overwrite)
+        watched = watched_run if args.in_process else watched_fleet
+        summary = watched(plan, args.out, stop, overwrite=args.overwrite)
     console.print(f"{summary_text(summary)}\nrun folder: {args.out}   (next: vtslam eval {args.out})")
     console.result({"run": str(args.out.resolve()), "source": plan.source.uri, **asdict(summary)})
     return stop.exit_status if summary.interrupted else 0
@@ -37,6 +35,15 @@ def watched_run(
         return plan.execute(
             out, overwrite=overwrite, created_by=created_by, on_frame=FrameWatch(progress), should_stop=stop
         )
+
+
+def watched_fleet(plan: RunPlan, out: Path, stop: StopRequest, *, overwrite: bool) -> RunSummary:
+    """Execute a plan in processes, with progress and lines about lost tracking and processes that died."""
+    from vtslam.services.supervisor.fleet_run import FleetHooks
+
+    with Progress(len(plan.source), what="mapping", unit="frame") as progress:
+        hooks = FleetHooks(on_frame=FrameWatch(progress), on_event=progress.note, should_stop=stop)
+        return plan.execute_in_fleet(out, hooks, overwrite=overwrite)
 
 
 def summary_text(summary: RunSummary) -> str:

@@ -12,11 +12,11 @@ import numpy.typing as npt
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.optim.alignment import PosePrior
-from vtslam.common.overlap.selection import CandidateView, overlap_shares, sections_to_pretrack
+from vtslam.common.overlap.selection import CandidateView, overlap_shares, sections_to_pretrack, world_points_m
 from vtslam.common.section import Section
 from vtslam.common.settings import TrackerSettings
 from vtslam.common.splat.engine import Engine
-from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section, world_points_m
+from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section
 from vtslam.services.tracker.odometry import rgbd_odometry
 from vtslam.services.tracker.optimisers import PoseEstimate, PoseOptimiser, make_optimiser
 from vtslam.services.tracker.state import (

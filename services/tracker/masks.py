@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.frame import Frame
-from vtslam.common.overlap.selection import seen_by_view
+from vtslam.common.overlap.selection import seen_by_view, world_points_m
 from vtslam.common.section import Section
 
 
@@ -22,14 +22,6 @@ def near_and_valid(
     if far_factor > 0 and largest_mean_depths_m:
         valid &= frame.depth_m() < far_factor * float(np.mean(largest_mean_depths_m))
     return np.asarray(valid)
-
-
-def world_points_m(
-    frame: Frame, T_world_camera: npt.NDArray[np.float64], mask: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.float64]:
-    """Back-projected pixels of ``mask`` in row order, float64 [N,3], world."""
-    points = frame.camera.back_projected(frame.depth_m())[mask].astype(np.float64)
-    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
 def visible_in_section(

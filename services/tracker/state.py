@@ -9,9 +9,10 @@ import numpy.typing as npt
 from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
+from vtslam.common.messages.mapping import MAX_LOSSES, MAX_MEAN_DEPTHS
 
-_HISTORY_FRAMES = 200  # losses remembered: enough for a stable median, bounded on endless streams
-_FAR_SAMPLES = 30  # largest mean depths kept for the far filter (docs/method.md, 2.2)
+_HISTORY_FRAMES = MAX_LOSSES  # losses remembered: enough for a stable median, bounded on endless streams
+_FAR_SAMPLES = MAX_MEAN_DEPTHS  # largest mean depths kept for the far filter (docs/method.md, 2.2)
 UNKNOWN_VARIANCE = 1e6  # of a pose that nothing was measured of
 
 

@@ -49,8 +49,10 @@ if TYPE_CHECKING:
     from vtslam.common.splat.native_engine import NativeEngine
     from vtslam.services.api import evaluate, open_run, run
     from vtslam.services.engines import make_engine
+    from vtslam.services.frame_facts import FrameFacts
     from vtslam.services.recorded_run import RecordedRun
-    from vtslam.services.recording_run import FrameFacts, RunSummary
+    from vtslam.services.run_record import RunSummary
+    from vtslam.services.sensor.publisher import FramePublisher
     from vtslam.services.sensor.sources.base import Source, SourceError
     from vtslam.services.sensor.sources.registry import open_source
     from vtslam.services.system import Archive, FrameReport, System
@@ -64,14 +66,15 @@ _HOMES = {
     "ConfigError": "common.config",
     "Engine": "common.splat.engine",
     "Frame": "common.frame",
-    "FrameFacts": "services.recording_run",
+    "FrameFacts": "services.frame_facts",
+    "FramePublisher": "services.sensor.publisher",
     "FrameReport": "services.system",
     "NativeEngine": "common.splat.native_engine",
     "RasterSettings": "common.splat.engine",
     "RecordedRun": "services.recorded_run",
     "Rendering": "common.splat.engine",
     "RunFolder": "storage.run_folder",
-    "RunSummary": "services.recording_run",
+    "RunSummary": "services.run_record",
     "Section": "common.section",
     "SectionArchive": "storage.section_convert",
     "Settings": "common.settings",
@@ -96,6 +99,7 @@ __all__ = [
     "Engine",
     "Frame",
     "FrameFacts",
+    "FramePublisher",
     "FrameReport",
     "NativeEngine",
     "RasterSettings",

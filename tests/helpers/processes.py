@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+from vtslam.common.fleet_folder import SHARED_MEMORY, read_owner
+from vtslam.common.shm.process_identity import own_identity
+
 _SOURCE = Path(__file__).resolve().parents[2] / "src"
 
 
@@ -10,3 +13,44 @@ def source_environment() -> dict[str, str]:
     """The environment, with this checkout's package first on the path."""
     paths = [str(_SOURCE), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def is_gone(pid: int) -> bool:
+    """Whether there is no such process, or only what its parent has not taken note of."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+def children_of(pid: int) -> set[int]:
+    """Pids of a process's children."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = path.read_text().rpartition(")")[2].split()[1]
+        except OSError:
+            continue
+        if int(parent) == pid:
+            found.add(int(path.parent.name))
+    return found
+
+
+def leftovers() -> list[str]:
+    """Processes and shared memory of fleets that this process started, or whose supervisor is gone."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"vtslam.services.supervisor.child" in words and b"--parent" in words:
+            parent = int(words[words.index(b"--parent") + 1])
+            if parent == os.getpid() or is_gone(parent):
+                found.append(f"process {path.parent.name}: {b' '.join(words).decode()}")
+    for path in SHARED_MEMORY.glob("vtslam-*"):
+        owner = read_owner(path)
+        if owner is None or owner.identity == own_identity() or not owner.is_alive:
+            found.append(str(path))
+    return found

@@ -152,17 +152,17 @@ def write_replica(folder: Path, *, num_frames: int = 3, width: int = 48, height:
     (folder / "results").mkdir(parents=True)
     camera = {"w": width, "h": height, "fx": 40.0, "fy": 42.0, "cx": 23.5, "cy": 17.5, "scale": 1000.0}
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    return _filled(recording)
+    return filled(recording)
 
 
 def write_seven_scenes(folder: Path, *, num_frames: int = 3) -> SevenScenesRecording:
     """Write a recording in the layout of 7-Scenes, 640x480."""
     rgb, depth = images(num_frames, width=640, height=480)
     folder.mkdir(parents=True)
-    return _filled(SevenScenesRecording(folder=folder, rgb=rgb, depth=depth, poses=camera_path(num_frames)))
+    return filled(SevenScenesRecording(folder=folder, rgb=rgb, depth=depth, poses=camera_path(num_frames)))
 
 
-def _filled(recording: R) -> R:
+def filled(recording: R) -> R:
     for index, (rgb, depth) in enumerate(zip(recording.rgb, recording.depth, strict=True)):
         write_png(recording.color_path(index), rgb)
         write_png(recording.depth_path(index), depth)

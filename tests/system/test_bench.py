@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.fleet_runs import SmallRecording, small_plan
 
+from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.comparison import comparison_table, flat
 from vtslam.services.bench.splat import yardstick_scene
 from vtslam.services.cli.__main__ import main
@@ -117,3 +119,11 @@ def test_a_ratio_stands_only_between_numbers() -> None:
     rows = {line.split()[0]: line.split()[1:] for line in table.splitlines()[1:]}
     assert rows == {"a": ["2", "4", "0.500"], "b.c": ["-", "1"], "b.d": ["x", "-"]}
     assert flat({"b": {"c": {"d": 1}}}) == {"b.c.d": 1}
+
+
+def test_a_fleet_under_fire_loses_nothing(small: SmallRecording) -> None:
+    values = bench_chaos(small_plan(small.files), kills=3, hangs=0, seed=2, on_frame=lambda facts: None)
+
+    assert is_sound(values)
+    assert values["kills"] >= 3  # the sensor may have finished before its turn
+    assert values["kills_in_shm_write"] >= 1

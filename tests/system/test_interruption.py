@@ -1,50 +1,30 @@
 """Ctrl-C and SIGTERM in the middle of a run."""
 
 import signal
-import subprocess
-import sys
+import time
 from pathlib import Path
 
 import pytest
-from helpers.processes import source_environment
+from helpers.cli_runs import DEADLINE_S, POLL_S, start_run, wait_for
+from helpers.processes import children_of, is_gone, leftovers
 
+from vtslam.common.fleet_folder import sweep_dead_fleets
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
 from vtslam.storage.run_folder import RunFolder
 
-_DEADLINE_S, _POLL_S = 60.0, 0.02
 
-
-def wait_for(path: Path, process: "subprocess.Popen[str]") -> None:
-    """Until ``path`` is there; fails if the process ends first or the deadline passes."""
-    for _ in range(int(_DEADLINE_S / _POLL_S)):
-        if path.exists():
-            return
-        try:
-            process.wait(_POLL_S)
-        except subprocess.TimeoutExpired:
-            continue
-        break
-    raise AssertionError(f"{path} did not appear; the process ended with {process.poll()}")
-
-
+@pytest.mark.parametrize("mode", [["--in-process"], []], ids=["one process", "fleet"])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_the_current_frame_is_finished_and_what_was_done_is_kept(
-    number: signal.Signals, status: int, tmp_path: Path
+def test_what_was_begun_is_finished_and_what_was_done_is_kept(
+    mode: list[str], number: signal.Signals, status: int, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    words = ["run", "sim:room?frames=2000", "--in-process", "--size", "48x36", "--set", "section.length=3"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "vtslam.services.cli", *words, "--out", str(out)],
-        env=source_environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+    process = start_run(out, *mode)
     try:
         wait_for(out / "sections" / "000001.vts", process)
         process.send_signal(number)
-        output, _ = process.communicate(timeout=_DEADLINE_S)
+        output, _ = process.communicate(timeout=DEADLINE_S)
     finally:
         process.kill()
         process.communicate()
@@ -58,3 +38,24 @@ def test_the_current_frame_is_finished_and_what_was_done_is_kept(
     assert (facts.finished, facts.interrupted) == (False, True)
     assert 6 <= facts.frames == len(rows) == len(poses) == in_sections < 2000
     assert main(["eval", str(out)]) == 0
+
+
+def test_without_their_supervisor_the_processes_of_a_fleet_end_and_are_swept(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    process = start_run(out)
+    try:
+        wait_for(out / "sections" / "000000.vts", process)
+        children = children_of(process.pid)
+    finally:
+        process.kill()
+        process.communicate()
+
+    assert len(children) == 3
+    for _ in range(int(DEADLINE_S / POLL_S)):
+        if all(is_gone(pid) for pid in children):
+            break
+        time.sleep(POLL_S)
+    assert all(is_gone(pid) for pid in children)
+    swept = sweep_dead_fleets()
+    assert any(name.startswith(f"run-{process.pid}-") for name in swept)
+    assert leftovers() == []

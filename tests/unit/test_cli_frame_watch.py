@@ -4,7 +4,7 @@ import pytest
 
 from vtslam.services.cli.console import Progress
 from vtslam.services.cli.frame_watch import FrameWatch
-from vtslam.services.recording_run import FrameFacts
+from vtslam.services.frame_facts import FrameFacts
 
 
 def facts(frame_id: int, state: str) -> FrameFacts:

@@ -108,7 +108,7 @@ def test_sections_are_sealed_when_full_and_at_the_end() -> None:
     assert [i for i, section_id in enumerate(sealed) if section_id is not None] == [N - 1, 2 * N - 1]
     assert [len(section.frames) for section in result.archive.written.values()] == [N, N, FRAMES - 2 * N]
     assert result.seal_renders >= 6
-    assert result.system.map.active is None
+    assert result.system.active is None
     assert result.system.finish() == 0
     assert all((report.seal_renders > 0) == (report.sealed_section_id is not None) for report in result.reports)
 
@@ -140,7 +140,7 @@ def test_reloaded_sections_are_equal_to_those_in_memory() -> None:
 
 def test_sections_that_left_memory_come_back_from_the_archive(monkeypatch: pytest.MonkeyPatch) -> None:
     # With room for one sealed section, heads that overlap with older ones load them: the run does not change.
-    monkeypatch.setattr("vtslam.services.system._RESIDENT_SECTIONS", 1)
+    monkeypatch.setattr("vtslam.services.section_map._RESIDENT_SECTIONS", 1)
     paged = run(settings_of("section.length=3"), room_frames()[:13])
     assert len(paged.archive.reads) > 0
     monkeypatch.undo()
@@ -174,8 +174,8 @@ def test_later_heads_have_neighbours_and_the_first_has_none() -> None:
     for index, frame in enumerate(room_frames()[:10]):
         system.process(frame)
         if index % 3 == 0:
-            assert system.map.active is not None
-            captured.append(system.map.active.neighbour_ids)
+            assert system.active is not None
+            captured.append(system.active.neighbour_ids)
     assert captured[0] == ()
     assert captured[1] == (0,)  # the previous and the overlapping one are the same
     assert captured[2] == (1, 0)

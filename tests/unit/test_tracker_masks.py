@@ -10,7 +10,8 @@ from helpers.smooth_room import SmoothRoom, small_camera
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
-from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section, world_points_m
+from vtslam.common.overlap.selection import world_points_m
+from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section
 
 CAMERA = small_camera()
 ROOM = SmoothRoom()

@@ -28,15 +28,37 @@ def unpack(data: bytes) -> Any:  # noqa: ANN401
     Raises:
         ValueError: The bytes are not what :func:`pack` would have written.
     """
-    try:
-        value = msgpack.unpackb(
-            data, max_array_len=_MAX_ITEMS, max_map_len=_MAX_ITEMS, max_str_len=MAX_BYTES, max_bin_len=0, max_ext_len=0
-        )
-    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        raise ValueError(f"is not msgpack as this format allows it ({error or type(error).__name__})") from error
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"takes {len(data)} bytes, at most {MAX_BYTES} are read")
+    value, length = unpack_first(data)
+    if length != len(data):
+        raise ValueError(f"is not msgpack as this format allows it ({len(data) - length} bytes after the value)")
     if pack(value) != data:
         raise ValueError("is not in the one form that writers give it (sorted keys, shortest encodings)")
     return value
+
+
+def unpack_first(data: bytes | memoryview) -> tuple[Any, int]:
+    """The first value of ``data`` in any encoding, and the bytes it takes; at most 65536 are looked at.
+
+    Nothing is said of the types inside; the memory taken is bounded by the bytes there, not by lengths they claim.
+
+    Raises:
+        ValueError: The bytes are not msgpack, are cut off, or claim more items or longer text than allowed.
+    """
+    unpacker = msgpack.Unpacker(
+        max_buffer_size=MAX_BYTES,
+        max_array_len=_MAX_ITEMS,
+        max_map_len=_MAX_ITEMS,
+        max_str_len=MAX_BYTES,
+        max_bin_len=0,
+        max_ext_len=0,
+    )
+    try:
+        unpacker.feed(data[:MAX_BYTES])
+        return unpacker.unpack(), unpacker.tell()
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise ValueError(f"is not msgpack as this format allows it ({error or type(error).__name__})") from error
 
 
 def _plain(value: Any, place: str, depth: int) -> Any:  # noqa: ANN401

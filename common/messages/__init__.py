@@ -1,0 +1,49 @@
+"""Everything that is said on the bus: typed records, and how they become bytes and back."""
+
+from vtslam.common.messages.base import Message
+from vtslam.common.messages.codec import Envelope, decode, encode
+from vtslam.common.messages.mapping import (
+    FrameCommitted,
+    LoadOutcome,
+    Odometry,
+    PoseQuality,
+    PoseState,
+    SectionArchived,
+    SectionReply,
+    SectionRequest,
+    SectionSealed,
+    TrackedPose,
+    TrackerHistory,
+)
+from vtslam.common.messages.rules import MessageError, Reason
+from vtslam.common.messages.running import Command, Control, ServiceState, ServiceStatus
+from vtslam.common.messages.sensing import Credit, FrameCondition, FrameDescriptor, FramePixels, PosePrior
+
+__all__ = [
+    "Command",
+    "Control",
+    "Credit",
+    "Envelope",
+    "FrameCommitted",
+    "FrameCondition",
+    "FrameDescriptor",
+    "FramePixels",
+    "LoadOutcome",
+    "Message",
+    "MessageError",
+    "Odometry",
+    "PosePrior",
+    "PoseQuality",
+    "PoseState",
+    "Reason",
+    "SectionArchived",
+    "SectionReply",
+    "SectionRequest",
+    "SectionSealed",
+    "ServiceState",
+    "ServiceStatus",
+    "TrackedPose",
+    "TrackerHistory",
+    "decode",
+    "encode",
+]

@@ -1,0 +1,306 @@
+"""The mapper as a service: a tracked pose in, a commit in the map store out, sections sealed when they are full."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from vtslam.common.bus import Bus
+from vtslam.common.frame import Frame
+from vtslam.common.messages import FrameCommitted, SectionSealed, ServiceState, TrackedPose
+from vtslam.common.section import Section
+from vtslam.common.settings import Settings
+from vtslam.common.shm.active_writer import ActiveWriter
+from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
+from vtslam.common.shm.frame_ring import FrameRingReader
+from vtslam.common.shm.map_store import MapStore
+from vtslam.common.shm.records import ActiveSpec, Commit
+from vtslam.common.shm.ring_layout import FrameDescriptor
+from vtslam.common.shm.sealed_block import sealed_bytes
+from vtslam.common.splat.engine import Engine
+from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED, TRACKER_POSE
+from vtslam.services.commit_facts import CommitFacts
+from vtslam.services.frame_facts import FIRST_FRAME_STATE, CommittedFrame, Seconds, frame_facts
+from vtslam.services.frame_journal import JournalWriter
+from vtslam.services.mapper.state import ActiveSection, CommitRecord
+from vtslam.services.mapper.turns import MapperTurns
+from vtslam.services.section_map import ReadsSections, SectionMap
+from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
+from vtslam.services.shared_sections import active_section_of, commit_of
+
+_NO_ROOM_S = 0.1  # until memory is asked for again
+_GIVE_UP_S = 60.0  # without memory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetPaths:
+    """Where the parts of the fleet's shared memory are that a mapper uses besides the map store: ring and journal."""
+
+    ring: Path
+    journal: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mapped:
+    """A frame that was mapped and is to be committed."""
+
+    commit: Commit
+    active: ActiveSection
+    facts: CommitFacts
+
+
+class MapperService:
+    """Commits each tracked frame to the map store, and seals sections.
+
+    All it needs to go on after a crash is in the store: a frame is either committed with everything that follows from
+    it, or will be mapped again from its pose, which the tracker then still has or finds again. What was committed last
+    is announced again after a restart.
+
+    Args:
+        bus: Its session.
+        link: What it says of itself and is told.
+        settings: The effective settings.
+        engine: The rasteriser.
+        store: The map store.
+        archive: Where sealed sections come from.
+        paths: Ring and journal.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        link: ServiceLink,
+        settings: Settings,
+        engine: Engine,
+        store: MapStore,
+        archive: ReadsSections,
+        paths: FleetPaths,
+    ) -> None:
+        self._clock, self._link, self._settings, self._store = bus.clock, link, settings, store
+        self._archive, self._paths = archive, paths
+        self._map = SectionMap(archive, candidate_interval=settings.section.candidate_interval)
+        self._turns = MapperTurns(settings, engine, self._map)
+        self._journal = JournalWriter(paths.journal)
+        self._tracked = bus.subscriber(TRACKER_POSE)
+        self._committed = bus.publisher(MAPPER_COMMITTED)
+        self._sealed = bus.publisher(SECTION_SEALED)
+        self._ring: FrameRingReader | None = None
+        self._poses: dict[int, TrackedPose] = {}
+        self._active: ActiveSection | None = None
+        self._facts: CommitFacts | None = None
+        self._writer: ActiveWriter | None = None
+        self._mapped: _Mapped | None = None
+        self._ended: tuple[Section, int, CommitFacts] | None = None  # section, renders and facts; not sealed yet
+        self._no_room_since_ns: int | None = None
+        self._take_over()
+
+    def step(self) -> float | None:
+        """See `Steps`."""
+        self._link.poll()
+        self._listen()
+        if self._link.stopping:
+            self._end()
+            return None
+        if self._mapped is not None:
+            return self._commit(self._mapped)
+        if self._active is not None and self._section_ends(self._active):
+            return self._seal(self._active)
+        pose = self._poses.pop(self._num_frames, None)
+        if pose is not None:
+            self._link.tell(ServiceState.WORKING, self._num_frames - 1)
+            self._mapped = self._map_frame(pose)
+            return 0.0
+        if self._is_drained():
+            self._end()
+            return None
+        self._link.tell(ServiceState.READY, self._num_frames - 1)
+        return HEARTBEAT_S
+
+    @property
+    def _num_frames(self) -> int:
+        """Frames committed."""
+        return 0 if self._facts is None else self._facts.num_frames
+
+    def _end(self) -> None:
+        self._journal.close()
+        self._link.tell(ServiceState.FINISHED, self._num_frames - 1)
+
+    def _is_drained(self) -> bool:
+        through = self._link.drain_through
+        return through is not None and self._num_frames > through
+
+    def _section_ends(self, active: ActiveSection) -> bool:
+        return len(active.section.frames) == self._settings.section.length or self._is_drained()
+
+    def _listen(self) -> None:
+        while (tracked := self._tracked.receive()) is not None:
+            if tracked.message.frame_id >= self._num_frames:
+                self._poses[tracked.message.frame_id] = tracked.message
+
+    # --- taking over ------------------------------------------------------------------------------------------------
+
+    def _take_over(self) -> None:
+        """Go on from the last commit in the store."""
+        self._writer = self._store.adopt_active()
+        state = None if self._writer is None else self._writer.state()
+        if state is not None:
+            self._active = active_section_of(state, self._settings.mapper)
+            self._map.committed(self._active.section)
+            self._facts = CommitFacts.unpacked(state.facts)
+        elif (last := self._store.last_commit()) is not None:
+            self._map.sealed(self._archive.read(last.section_id))
+            self._facts = CommitFacts.unpacked(last.facts)
+        if self._facts is not None and not (self._active is not None and self._section_ends(self._active)):
+            self._announce(self._facts)
+
+    # --- one frame --------------------------------------------------------------------------------------------------
+
+    def _map_frame(self, pose: TrackedPose) -> _Mapped:
+        start_ns = self._clock.monotonic_ns()
+        section_id, row = divmod(self._num_frames, self._settings.section.length)
+        frame = self._open_ring().copied(FrameDescriptor(slot=pose.slot, sequence=pose.slot_sequence))
+        budget_s = self._settings.mapper.budget_s
+        active, record = self._turns.map(
+            frame,
+            pose.T_world_camera,
+            self._active,
+            section_id=section_id,
+            row=row,
+            in_time=lambda: budget_s == 0 or pose.track_s + 1e-9 * (self._clock.monotonic_ns() - start_ns) < budget_s,
+        )
+        map_s = 1e-9 * (self._clock.monotonic_ns() - start_ns)
+        facts = self._facts_of(frame, pose, record, map_s)
+        commit = commit_of(
+            active,
+            frame,
+            held_out=record.held_out,
+            keep_moments=self._settings.mapper.keep_moments,
+            facts=facts.packed(),
+        )
+        return _Mapped(commit, active, facts)
+
+    def _facts_of(self, frame: Frame, pose: TrackedPose, record: CommitRecord, map_s: float) -> CommitFacts:
+        total_s = pose.read_s + pose.track_s + map_s
+        facts = frame_facts(
+            record,
+            pose.quality,
+            pose.covariance,
+            state=FIRST_FRAME_STATE if pose.quality is None else pose.state.value,
+            seal_renders=0,
+            seconds=Seconds(read_s=pose.read_s, track_s=pose.track_s, map_s=map_s, total_s=total_s),
+        )
+        return CommitFacts(
+            num_frames=self._num_frames + 1,
+            sequence=pose.slot_sequence,
+            iterations=record.iterations,
+            frame=CommittedFrame(
+                facts=facts, capture_time_ns=frame.capture_time_ns, T_world_camera=record.T_world_camera
+            ),
+            T_world_previous=None if self._facts is None else self._facts.frame.T_world_camera,
+            history=pose.history,
+        )
+
+    def _commit(self, mapped: _Mapped) -> float:
+        try:
+            if self._writer is None:
+                self._writer = self._store.create_active(self._spec(mapped.active.section))
+            self._writer.commit(mapped.commit)
+        except (MapStoreFull, SharedMemoryFull) as error:
+            return self._wait_for_room(error)
+        self._no_room_since_ns = self._mapped = None
+        self._active, self._facts = mapped.active, mapped.facts
+        self._map.committed(mapped.active.section)
+        self._link.count("frames.committed")
+        if not self._section_ends(mapped.active):
+            self._announce(mapped.facts)
+        return 0.0
+
+    def _spec(self, section: Section) -> ActiveSpec:
+        length, mapper = self._settings.section.length, self._settings.mapper
+        per_pixel = 5 if mapper.edge_supplement else 1
+        return ActiveSpec(
+            section_id=section.section_id,
+            camera=section.camera,
+            depth_scale_m=section.depth_scale_m,
+            depth_factor=section.depth_factor,
+            max_frames=length,
+            max_gaussians=per_pixel * section.camera.width * section.camera.height * length,
+            with_moments=mapper.keep_moments,
+        )
+
+    def _wait_for_room(self, error: MapStoreFull | SharedMemoryFull) -> float:
+        """Sections leave the store once they are on disk; if that does not help in time, the error is raised."""
+        now_ns = self._clock.monotonic_ns()
+        self._no_room_since_ns = self._no_room_since_ns or now_ns
+        if not self._store.sealed_ids() or now_ns - self._no_room_since_ns > _GIVE_UP_S * 1e9:
+            raise error
+        self._link.tell(ServiceState.DEGRADED, self._num_frames - 1, detail=str(error))
+        return _NO_ROOM_S
+
+    # --- the end of a section ---------------------------------------------------------------------------------------
+
+    def _seal(self, active: ActiveSection) -> float:
+        assert self._writer is not None
+        if self._ended is None:
+            self._ended = self._end_of(active)
+        section, renders, facts = self._ended
+        try:
+            self._store.seal(self._writer, section, facts.packed())
+        except (MapStoreFull, SharedMemoryFull) as error:
+            return self._wait_for_room(error)
+        self._no_room_since_ns = self._ended = self._writer = self._active = None
+        self._facts = facts
+        self._map.sealed(section)
+        self._link.count("sections.sealed")
+        self._sealed.publish(
+            SectionSealed(
+                section_id=section.section_id,
+                block=f"sealed-{section.section_id:06d}",
+                generation=0,
+                first_frame_id=section.head.frame_id,
+                frames=len(section.frames),
+                gaussians=section.gaussians.count,
+                bytes_held=sealed_bytes(section),
+                renders=renders,
+                epoch=self._link.epoch,
+            )
+        )
+        self._announce(facts)
+        return 0.0
+
+    def _end_of(self, active: ActiveSection) -> tuple[Section, int, CommitFacts]:
+        assert self._facts is not None
+        start_ns = self._clock.monotonic_ns()
+        section, renders = self._turns.seal(active)
+        seconds = 1e-9 * (self._clock.monotonic_ns() - start_ns)
+        return section, renders, self._facts.with_seal(renders=renders, seconds=seconds)
+
+    # --- telling others ---------------------------------------------------------------------------------------------
+
+    def _announce(self, facts: CommitFacts) -> None:
+        """Tell of the last commit; harmless if that was done before."""
+        self._journal.append(facts.frame)
+        self._open_ring().acknowledge(facts.sequence)
+        frame, about = facts.frame, facts.frame.facts
+        self._committed.publish(
+            FrameCommitted(
+                frame_id=about.frame_id,
+                capture_time_ns=frame.capture_time_ns,
+                section_id=about.section_id,
+                frame_index=(facts.num_frames - 1) % self._settings.section.length,
+                T_world_camera=frame.T_world_camera,
+                exposure=facts.exposure,
+                gaussians_added=about.gaussians_added,
+                gaussians=about.gaussians,
+                iterations=facts.iterations,
+                renders=about.map_renders,
+                loss=about.map_loss if math.isfinite(about.map_loss) else 0.0,
+                held_out=about.held_out,
+                block=f"{'sealed' if self._active is None else 'active'}-{about.section_id:06d}",
+                generation=0 if self._writer is None else self._writer.generation,
+                epoch=self._link.epoch,
+            )
+        )
+
+    def _open_ring(self) -> FrameRingReader:
+        self._ring = self._ring or FrameRingReader(self._paths.ring)
+        return self._ring

@@ -1,0 +1,141 @@
+"""The sensor service of a live fleet: frames that a publisher sends over the bus, into the ring; credit back."""
+
+from pathlib import Path
+
+from vtslam.common.bus import Bus
+from vtslam.common.frame import Frame
+from vtslam.common.messages import Credit, FrameDescriptor, FramePixels, ServiceState
+from vtslam.common.shm.frame_ring import FrameRingReader, FrameRingWriter
+from vtslam.common.shm.ring_layout import FrameDescriptor as RingDescriptor
+from vtslam.common.topics import MAPPER_COMMITTED, SENSOR_CREDIT, SENSOR_FRAME, SENSOR_PIXELS
+from vtslam.services.sensor.ring import CREDIT, make_ring
+from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
+
+WINDOW = 4  # frames a publisher may have under way
+
+
+class LiveSensor:
+    """Puts the frames of a publisher into the ring, each once, in the order of their numbers.
+
+    The fleet numbers its frames from 0, and says in its credit which number it wants next; a publisher counts from
+    there. A publisher keeps what is not committed, so a sensor that starts again gets it again. Frames of other
+    numbers, of another camera or scale than the first one's, are refused and counted.
+
+    Args:
+        bus: Its session.
+        link: What it says of itself and is told.
+        ring_path: Where the ring is, or will be once the first frame came.
+    """
+
+    def __init__(self, bus: Bus, link: ServiceLink, ring_path: Path) -> None:
+        self._clock, self._link, self._ring_path = bus.clock, link, ring_path
+        self._pixels = bus.subscriber(SENSOR_PIXELS)
+        self._commits = bus.subscriber(MAPPER_COMMITTED)
+        self._frames = bus.publisher(SENSOR_FRAME)
+        self._credit = bus.publisher(SENSOR_CREDIT)
+        self._told: tuple[int, int] | None = None
+        self._told_ns = 0
+        self._pending: FramePixels | None = None
+        self._like: Frame | None = None  # has the camera and scale of all frames
+        self._ring = FrameRingWriter.adopt(ring_path) if ring_path.exists() else None
+        if self._ring is not None:
+            self._announce_again(FrameRingReader(ring_path))
+
+    def step(self) -> float | None:
+        """See `Steps`."""
+        self._link.poll()
+        while self._commits.receive() is not None:
+            pass  # what is committed is acknowledged in the ring
+        if self._link.stopping:
+            self._link.tell(ServiceState.FINISHED, self._wanted - 1)
+            return None
+        progress = self._take_one()
+        self._grant()
+        self._link.tell(ServiceState.WORKING if progress else ServiceState.READY, self._wanted - 1)
+        return 0.0 if progress else HEARTBEAT_S
+
+    @property
+    def _wanted(self) -> int:
+        """The number of the next frame."""
+        return 0 if self._ring is None else self._ring.published
+
+    def _take_one(self) -> bool:
+        """Bring one message further; false if there is none, or the ring is full."""
+        if self._pending is None:
+            received = self._pixels.receive()
+            if received is None:
+                return False
+            self._pending = received.message
+        pixels = self._pending
+        if not self._is_wanted(pixels):
+            self._pending = None
+            return True
+        frame = _frame_of(pixels)
+        if self._ring is None:
+            self._ring = make_ring(self._ring_path, frame.camera)
+        descriptor = self._ring.try_publish(frame, credit=CREDIT)
+        if descriptor is None:
+            return False
+        self._pending, self._like = None, self._like or frame
+        self._announce(frame, descriptor)
+        self._link.count("frames.published")
+        return True
+
+    def _is_wanted(self, pixels: FramePixels) -> bool:
+        if pixels.frame_id != self._wanted:
+            self._link.count("frames.repeated" if pixels.frame_id < self._wanted else "frames.ahead")
+            return False
+        like = self._like
+        if like is not None and (like.camera, like.depth_scale_m) != (pixels.camera, pixels.depth_scale_m):
+            self._link.count("frames.other_camera")
+            return False
+        return True
+
+    def _grant(self) -> None:
+        """Say how far publishers may go, when that has changed and now and then."""
+        committed = -1 if self._ring is None else self._ring.acknowledged - 1
+        now_ns = self._clock.monotonic_ns()
+        if self._told == (committed, self._wanted) and now_ns - self._told_ns < HEARTBEAT_S * 1e9:
+            return
+        self._told, self._told_ns = (committed, self._wanted), now_ns
+        self._credit.publish(
+            Credit(
+                acknowledged_frame_id=committed,
+                next_frame_id=self._wanted,
+                limit_frame_id=self._wanted + WINDOW - 1,
+                epoch=self._link.epoch,
+            )
+        )
+
+    def _announce_again(self, reader: FrameRingReader) -> None:
+        """Frames that are not done with, of a sensor that died; any of the ring's frames says what they are like."""
+        newest = reader.newest()
+        if newest is not None:
+            self._like = reader.copied(newest)
+        for descriptor in reader.unacknowledged():
+            with reader.using(descriptor) as frame:
+                self._announce(frame, descriptor)
+
+    def _announce(self, frame: Frame, descriptor: RingDescriptor) -> None:
+        self._frames.publish(
+            FrameDescriptor(
+                frame_id=frame.frame_id,
+                capture_time_ns=frame.capture_time_ns,
+                slot=descriptor.slot,
+                slot_sequence=descriptor.sequence,
+                width=frame.camera.width,
+                height=frame.camera.height,
+                epoch=self._link.epoch,
+            )
+        )
+
+
+def _frame_of(pixels: FramePixels) -> Frame:
+    return Frame(
+        frame_id=pixels.frame_id,
+        capture_time_ns=pixels.capture_time_ns,
+        rgb=pixels.rgb,
+        depth=pixels.depth,
+        depth_scale_m=pixels.depth_scale_m,
+        camera=pixels.camera,
+    )

@@ -1,0 +1,149 @@
+"""The entry of a fleet's processes: ``python -m vtslam.services.supervisor.child NAME FLEET ...``, by the supervisor.
+
+Settings and source come from ``run.toml`` in the run folder that the fleet's folder names.
+"""
+
+import argparse
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vtslam.common.fleet_folder import FleetFolder, read_owner
+
+if TYPE_CHECKING:
+    from vtslam.common.bus import Bus, Steps
+    from vtslam.common.settings import Settings
+    from vtslam.services.service_link import ServiceLink
+    from vtslam.storage.run_folder import RunFolder
+
+REFUSED = 3  # exit status: the input or the machine cannot be used; trying again would not help
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """What a service is built from."""
+
+    bus: "Bus"
+    link: "ServiceLink"
+    folder: FleetFolder
+    run: "RunFolder"
+    settings: "Settings"
+    source: str
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one service to its end; 0 if it came to one, `REFUSED` with the reason in the fleet's folder."""
+    words = argparse.ArgumentParser()
+    words.add_argument("name")
+    words.add_argument("fleet")
+    words.add_argument("--base", type=Path, required=True)
+    words.add_argument("--epoch", type=int, required=True)
+    words.add_argument("--parent", type=int, required=True)
+    args = words.parse_args(argv)
+    _die_with(args.parent)
+    folder = FleetFolder.open(args.fleet, base=args.base)
+    return _run(args.name, folder, args.fleet, args.epoch)
+
+
+def _die_with(parent: int) -> None:
+    """Be killed when the supervisor dies, also if that happened before this call."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
+    from vtslam.common.bus import Member, run_steps
+    from vtslam.common.bus_zenoh import join
+    from vtslam.common.config import load
+    from vtslam.common.settings import Settings
+    from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
+    from vtslam.services.sensor.sources.base import SourceError
+    from vtslam.services.service_link import ServiceLink
+    from vtslam.services.supervisor.processes import process_named
+    from vtslam.storage.errors import StorageError
+    from vtslam.storage.run_folder import RunFolder
+
+    owner = read_owner(folder.path)
+    assert owner is not None
+    run = RunFolder.open(Path(owner.run_folder))
+    info = run.read_info()
+    settings = load(Settings, [(str(run.path), info.settings)])
+    member = Member(fleet=fleet, role=process_named(name).role, name=name)
+    with join(member, folder.path) as bus:
+        link = ServiceLink(bus, epoch)
+        link.stop_on_sigterm()
+        try:
+            parts = _Parts(bus, link, folder, run, settings, info.facts.source)
+            run_steps(_BUILDERS[name](parts), bus)
+        except (SourceError, StorageError, MapStoreFull, SharedMemoryFull) as error:
+            folder.write_failure(name, str(error))
+            return REFUSED
+    return 0
+
+
+def _sensor(parts: _Parts) -> "Steps":
+    from vtslam.services.sensor.live import LiveSensor
+    from vtslam.services.sensor.service import RecordingSensor
+    from vtslam.services.sensor.sources.registry import open_source
+    from vtslam.services.supervisor.processes import LIVE_SOURCE
+
+    if parts.source == LIVE_SOURCE:
+        return LiveSensor(parts.bus, parts.link, parts.folder.ring_path)
+    return RecordingSensor(parts.bus, parts.link, open_source(parts.source), parts.folder.ring_path)
+
+
+def _tracker(parts: _Parts) -> "Steps":
+    from vtslam.services.engines import make_engine, thread_count
+    from vtslam.services.map_follower import MapFollower, StoreArchive
+    from vtslam.services.supervisor.store import map_store
+    from vtslam.services.tracker.core import Tracker
+    from vtslam.services.tracker.service import TrackerService
+    from vtslam.storage.section_convert import SectionArchive
+
+    settings, store = parts.settings, map_store(parts.folder, parts.settings)
+    follower = MapFollower(
+        store,
+        StoreArchive(store, SectionArchive(parts.run)),
+        candidate_interval=settings.section.candidate_interval,
+    )
+    threads, engine = thread_count(settings.splat), make_engine(settings.splat)
+    return TrackerService(
+        parts.bus,
+        parts.link,
+        Tracker(settings=settings.tracker, engine=engine, threads=threads),
+        follower,
+        parts.folder.ring_path,
+        section_length=settings.section.length,
+    )
+
+
+def _mapper(parts: _Parts) -> "Steps":
+    from vtslam.services.engines import make_engine
+    from vtslam.services.map_follower import StoreArchive
+    from vtslam.services.mapper.service import FleetPaths, MapperService
+    from vtslam.services.supervisor.store import map_store
+    from vtslam.storage.section_convert import SectionArchive
+
+    store = map_store(parts.folder, parts.settings)
+    return MapperService(
+        parts.bus,
+        parts.link,
+        parts.settings,
+        make_engine(parts.settings.splat),
+        store,
+        StoreArchive(store, SectionArchive(parts.run)),
+        FleetPaths(ring=parts.folder.ring_path, journal=parts.folder.journal_path),
+    )
+
+
+_BUILDERS: dict[str, Callable[[_Parts], "Steps"]] = {"sensor": _sensor, "tracker": _tracker, "mapper": _mapper}
+
+if __name__ == "__main__":
+    sys.exit(main())

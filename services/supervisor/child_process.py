@@ -1,0 +1,138 @@
+"""One process of a fleet as its supervisor sees it: started, heard of, dead, started again."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+
+from vtslam.common.fleet_folder import FleetFolder
+from vtslam.common.messages import ServiceState, ServiceStatus
+from vtslam.services.supervisor.child import REFUSED
+from vtslam.services.supervisor.errors import FleetError, ProcessRefused
+from vtslam.services.supervisor.processes import Process
+
+_MODULE = "vtslam.services.supervisor.child"
+_MAX_DEATHS = 5  # without a commit in between
+_BACK_OFF_S = (0.0, 0.0, 0.2, 0.5, 1.0, 2.0)  # before a start, by such deaths
+_MISSING_S = 3.0  # without a token on the bus although the process runs: it is stopped as a whole
+_READY = frozenset(set(ServiceState) - {ServiceState.STARTING})
+
+
+class ChildProcess:
+    """A process and its history.
+
+    Args:
+        process: What it is.
+        fleet: Name of the fleet.
+        folder: The fleet's folder.
+        hang_s: Silence of its work loop that is a hang.
+
+    Attributes:
+        epoch: How often it was started.
+        status: What it said last, in this epoch; None if nothing.
+        finished: Whether it came to its end.
+        deaths: How often it died or was killed.
+        hangs: How often it was killed for being silent.
+    """
+
+    def __init__(self, process: Process, *, fleet: str, folder: FleetFolder, hang_s: float) -> None:
+        self.process, self._fleet, self._folder, self._hang_s = process, fleet, folder, hang_s
+        self.epoch = self.deaths = self.hangs = 0
+        self.status: ServiceStatus | None = None
+        self.finished = False
+        self.peak_rss_mb = 0.0
+        self._popen: subprocess.Popen[bytes] | None = None
+        self._start_at_s = 0.0
+        self._heard_s = self._present_s = 0.0
+        self._deaths_here, self._frames_then = 0, -1
+
+    @property
+    def pid(self) -> int | None:
+        """Its process, if it runs."""
+        return None if self._popen is None else self._popen.pid
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it works, or has come to its end."""
+        return self.finished or (self.status is not None and self.status.state in _READY)
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether it should be started now."""
+        return self._popen is None and not self.finished and now_s >= self._start_at_s
+
+    def start(self, now_s: float, environment: Mapping[str, str]) -> None:
+        """Start it; the one before it is dead. From the thread that lives as long as the fleet: see `child`."""
+        assert self._popen is None
+        self.epoch, self.status = self.epoch + 1, None
+        self._heard_s = self._present_s = now_s
+        words = [self.process.name, self._fleet, "--base", str(self._folder.path.parent)]
+        words += ["--epoch", str(self.epoch), "--parent", str(os.getpid())]
+        self._popen = subprocess.Popen(
+            [sys.executable, "-m", _MODULE, *words],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **environment},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C in a terminal is for the supervisor
+        )
+
+    def heard(self, status: ServiceStatus, now_s: float) -> None:
+        """Take in a heartbeat; those of former starts are nobody's."""
+        if status.epoch == self.epoch:
+            self.status, self._heard_s = status, now_s
+            self.peak_rss_mb = max(self.peak_rss_mb, status.gauges.get("peak_rss_mb", 0.0))
+
+    def seen(self, *, on_bus: bool, now_s: float) -> None:
+        """Note whether it is on the bus; before its first heartbeat it need not be."""
+        if on_bus or self.status is None:
+            self._present_s = now_s
+
+    def reap(self, now_s: float, frames: int) -> str | None:
+        """See whether it has ended; what to tell the user if it died.
+
+        Raises:
+            ProcessRefused: It said that going on is of no use.
+            FleetError: It died too often without a commit in between.
+        """
+        code = None if self._popen is None else self._popen.poll()
+        if code is None:
+            return None
+        self._popen = None
+        if code == 0:
+            self.finished = True
+            return None
+        if code == REFUSED:
+            self.finished = True
+            raise ProcessRefused(self.process.name, self._folder.failure(self.process.name))
+        how = f"killed by signal {-code}" if code < 0 else f"ended with status {code}"
+        return self._died(how, now_s, frames)
+
+    def kill_if_hung(self, now_s: float, frames: int) -> str | None:
+        """Kill it if it is silent for too long; what to tell the user then."""
+        if self._popen is None:
+            return None
+        if now_s - self._present_s > _MISSING_S:
+            why = "left the bus while it ran"
+        elif now_s - self._heard_s > self._hang_s:
+            why = f"silent for {self._hang_s:g} s"
+        else:
+            return None
+        self.kill()
+        self.hangs += 1
+        return self._died(why, now_s, frames)
+
+    def kill(self) -> None:
+        """End it at once, and wait for that."""
+        if self._popen is not None:
+            self._popen.kill()
+            self._popen.wait()
+            self._popen = None
+
+    def _died(self, how: str, now_s: float, frames: int) -> str:
+        self.deaths += 1
+        self._deaths_here = self._deaths_here + 1 if frames == self._frames_then else 1
+        self._frames_then = frames
+        text = f"{self.process.name}: {how} after {frames} frames"
+        if self._deaths_here > _MAX_DEATHS:
+            raise FleetError(f"{text}, for the {self._deaths_here}th time without a commit in between")
+        self._start_at_s = now_s + _BACK_OFF_S[self._deaths_here]
+        return f"{text}; started again"

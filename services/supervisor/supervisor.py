@@ -1,0 +1,185 @@
+"""The supervisor: starts the processes of a fleet in order, watches them, starts them again, stops them in order."""
+
+from collections.abc import Callable, Mapping
+from enum import Enum
+
+from vtslam.common.bus import Bus
+from vtslam.common.fleet_folder import FleetFolder
+from vtslam.common.messages import Command, Control, ServiceState
+from vtslam.common.shm.errors import SharedMemoryError
+from vtslam.common.shm.frame_ring import FrameRingReader
+from vtslam.common.topics import CONTROL, EVERY_SERVICE, MAPPER_COMMITTED, STATUS
+from vtslam.services.service_link import ServiceLink
+from vtslam.services.supervisor.child_process import ChildProcess
+from vtslam.services.supervisor.errors import ProcessRefused
+from vtslam.services.supervisor.processes import MAPPER, PROCESSES, SENSOR, TRACKER
+from vtslam.services.supervisor.recorder import Recorder
+
+_POLL_S = 0.1  # between looks at the processes, when the bus is silent
+
+Environment = Callable[[str, int], Mapping[str, str]]  # of a process by name, at its n-th start
+
+
+class _Phase(Enum):
+    """How far the fleet is with ending; each begins when a process has come to its end."""
+
+    RUNNING = "running"
+    MAPPING_REST = "mapping the rest"  # the sensor has ended
+    TRACKER_STOPPING = "stopping the tracker"  # the mapper has ended
+    ENDED = "ended"
+
+
+class Supervisor:
+    """Watches the processes of one fleet; a service of its own, whose steps take part in the fleet's work.
+
+    Args:
+        bus: A session of the supervisor, in the hub.
+        fleet: Name of the fleet.
+        folder: The fleet's folder.
+        recorder: Writes the run folder.
+        hang_s: Silence of a work loop that is a hang.
+        on_event: Told, in words, of what the user should know.
+        environment: Variables for a process, for tests and experiments.
+
+    Attributes:
+        refusal: Why the recording could not be read to its end, if so.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        *,
+        fleet: str,
+        folder: FleetFolder,
+        recorder: Recorder,
+        hang_s: float,
+        on_event: Callable[[str], None] = lambda text: None,
+        environment: Environment = lambda name, epoch: {},
+    ) -> None:
+        self._bus, self._folder, self._recorder = bus, folder, recorder
+        self._on_event, self._environment = on_event, environment
+        self._children = {
+            process.name: ChildProcess(process, fleet=fleet, folder=folder, hang_s=hang_s) for process in PROCESSES
+        }
+        self._link = ServiceLink(bus, 1)
+        self._alive = bus.watch_alive()
+        self._heartbeats = bus.subscriber(STATUS, service=EVERY_SERVICE)
+        self._commits = bus.subscriber(MAPPER_COMMITTED, newest_only=True)
+        self._orders = {name: bus.publisher(CONTROL, service=name) for name in self._children}
+        self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
+        self._phase = _Phase.RUNNING
+        self.refusal: ProcessRefused | None = None
+
+    @property
+    def children(self) -> Mapping[str, ChildProcess]:
+        """The processes by name."""
+        return self._children
+
+    def stop(self) -> None:
+        """End the fleet in order: what was published is mapped, the open section sealed. Further calls do nothing."""
+        self._link.stopping = True
+
+    def step(self) -> float | None:
+        """See `Steps`.
+
+        Raises:
+            FleetError: A process cannot be kept alive.
+            StorageError: The run folder cannot be written.
+        """
+        self._listen()
+        self._watch()
+        self._advance()
+        self._recorder.step()
+        if self._phase is _Phase.ENDED:
+            self._tell(ServiceState.FINISHED)
+            return None
+        self._start_due()
+        self._tell(ServiceState.WORKING if self._phase is _Phase.RUNNING else ServiceState.DRAINING)
+        return _POLL_S
+
+    def kill_all(self) -> None:
+        """End all processes at once, and wait for that."""
+        for child in self._children.values():
+            child.kill()
+
+    # --- watching ---------------------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        return 1e-9 * self._bus.clock.monotonic_ns()
+
+    def _listen(self) -> None:
+        while (received := self._heartbeats.receive()) is not None:
+            child = self._children.get(received.message.service)
+            if child is not None:
+                child.heard(received.message, 1e-9 * received.arrival_time_ns)
+        self._commits.receive()  # wakes; what was committed is in the journal
+
+    def _watch(self) -> None:
+        now_s, names = self._now_s(), self._alive.names()
+        for name, child in self._children.items():
+            child.seen(on_bus=name in names, now_s=now_s)
+            try:
+                event = child.reap(now_s, self._recorder.num_frames)
+            except ProcessRefused as refusal:
+                if name != SENSOR.name:
+                    raise
+                self.refusal = refusal  # what was read before is mapped to its end
+                event = None
+            event = event or child.kill_if_hung(now_s, self._recorder.num_frames)
+            if event is not None:
+                self._on_event(event)
+
+    def _start_due(self) -> None:
+        now_s = self._now_s()
+        for name, child in self._children.items():
+            ready = all(self._children[other].is_ready for other in child.process.after)
+            if child.is_due(now_s) and (ready or child.epoch > 0):
+                child.start(now_s, self._environment(name, child.epoch + 1))
+
+    def _tell(self, state: ServiceState) -> None:
+        for name, child in self._children.items():
+            self._link.counters[f"{name}.deaths"] = child.deaths
+            self._link.counters[f"{name}.hangs"] = child.hangs
+        self._link.tell(state, self._recorder.num_frames - 1, detail=self._phase.value)
+
+    # --- ending -----------------------------------------------------------------------------------------------------
+
+    def _advance(self) -> None:
+        """The sensor ends first, then the mapper with what the ring holds, then the tracker."""
+        sensor, mapper, tracker = (self._children[process.name] for process in (SENSOR, MAPPER, TRACKER))
+        if self._phase is _Phase.RUNNING:
+            if self._link.stopping:
+                self._end(sensor)
+            if sensor.finished:
+                self._phase = _Phase.MAPPING_REST
+        if self._phase is _Phase.MAPPING_REST:
+            self._order(mapper, Command.DRAIN, through_frame_id=self._last_published())
+            if mapper.finished:
+                self._phase = _Phase.TRACKER_STOPPING
+        if self._phase is _Phase.TRACKER_STOPPING:
+            self._end(tracker)
+            if tracker.finished:
+                self._phase = _Phase.ENDED
+
+    def _end(self, child: ChildProcess) -> None:
+        """Let a process end; one that does not run stays so."""
+        if child.pid is None:
+            child.finished = True
+        else:
+            self._order(child, Command.STOP)
+
+    def _order(self, child: ChildProcess, command: Command, *, through_frame_id: int = -1) -> None:
+        """Give an order once to each start of a process; the bus keeps it for one that is not listening yet."""
+        name = child.process.name
+        if child.pid is None or self._ordered.get(name) == (command, child.epoch):
+            return
+        self._ordered[name] = command, child.epoch
+        self._orders[name].publish(
+            Control(command=command, through_frame_id=through_frame_id, epoch=child.epoch, why="the run ends")
+        )
+
+    def _last_published(self) -> int:
+        try:
+            return FrameRingReader(self._folder.ring_path).published - 1
+        except SharedMemoryError:
+            return -1  # the sensor ended before it made the ring

@@ -1,0 +1,198 @@
+"""Random and mutated messages on every topic of a real bus: none crashes a reader, every refused one is counted."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+import zenoh
+from helpers.bus_backends import ZenohBackend, zenoh_backend
+from helpers.bus_messages import MAX_BYTES, RANDOM
+
+from vtslam.common.bus import Bus
+from vtslam.common.messages import Message, MessageError, SectionRequest, decode, encode
+from vtslam.common.topics import EVERY_SERVICE, QUERIES, SECTION_LOAD, TOPICS, QueryTopic, Role, Topic
+
+SEED = 20_26
+MESSAGES = 20_000
+PATIENCE_S = 60.0
+FEW_BYTES = 4096  # of a made-up message; pixels are small here as well
+
+ODD_VALUES: tuple[Any, ...] = (
+    None, True, -1, 2**63, 2**64 - 1, -(2**63), 0.5, float("nan"), float("inf"), "", "x" * 300, "\x00", "../..", b"",
+    b"raw", [], [0.0] * 16, [float("nan")] * 36, [[[[]]]], {}, {"a": {"b": 1}}, {1: 2}, msgpack.ExtType(5, b"x"),
+)  # fmt: skip
+
+
+@pytest.fixture
+def backend() -> Iterator[ZenohBackend]:
+    with zenoh_backend() as opened:
+        yield opened
+
+
+def _flipped(rng: np.random.Generator, data: bytes) -> bytes:
+    changed = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        changed[int(rng.integers(len(changed)))] ^= 1 << int(rng.integers(8))
+    return bytes(changed)
+
+
+def _cut(rng: np.random.Generator, data: bytes) -> bytes:
+    return data[: int(rng.integers(len(data)))]
+
+
+def _grown(rng: np.random.Generator, data: bytes) -> bytes:
+    return data + rng.bytes(int(rng.integers(1, 64)))
+
+
+def _spliced(rng: np.random.Generator, data: bytes) -> bytes:
+    start, end = sorted(int(x) for x in rng.integers(0, len(data), 2))
+    return data[:start] + rng.bytes(int(rng.integers(0, 32))) + data[end:]
+
+
+def _noise(rng: np.random.Generator, data: bytes) -> bytes:
+    return rng.bytes(int(rng.integers(0, FEW_BYTES)))
+
+
+def _odd_field(rng: np.random.Generator, data: bytes) -> bytes:
+    """One value anywhere in the envelope replaced by one of another type, shape or range."""
+    unpacker = msgpack.Unpacker()
+    unpacker.feed(data)
+    envelope = unpacker.unpack()
+    holder: Any = envelope
+    while True:
+        places = list(holder) if isinstance(holder, dict) else list(range(len(holder)))
+        place = places[int(rng.integers(len(places)))]
+        if not isinstance(holder[place], dict | list) or not holder[place] or rng.random() < 0.2:
+            break
+        holder = holder[place]
+    holder[place] = ODD_VALUES[int(rng.integers(len(ODD_VALUES)))]
+    packed: bytes = msgpack.packb(envelope)
+    return packed + data[unpacker.tell() :]
+
+
+def _too_long(rng: np.random.Generator, data: bytes) -> bytes:
+    return data + bytes(20_000)
+
+
+MUTATIONS = (_flipped, _cut, _grown, _spliced, _noise, _odd_field, _odd_field, _odd_field, _too_long)
+
+
+def _good(rng: np.random.Generator, kind: type[Message], number: int) -> bytes:
+    return encode(RANDOM[kind](rng), origin=number, sequence=0, publish_time_ns=1, max_bytes=MAX_BYTES)
+
+
+def _mutated(rng: np.random.Generator, kind: type[Message], number: int) -> bytes:
+    wrong = rng.random() < 0.1
+    data = _good(rng, list(RANDOM)[int(rng.integers(len(RANDOM)))] if wrong else kind, number)
+    if rng.random() < 0.1:
+        return data
+    return MUTATIONS[int(rng.integers(len(MUTATIONS)))](rng, data)
+
+
+def _verdict(kind: type[Message], data: bytes, max_bytes: int) -> str:
+    """The reason of refusal, or nothing; anything else that is raised fails the test."""
+    try:
+        decode(kind, data, max_bytes=max_bytes)
+    except MessageError as error:
+        return error.reason.value
+    return ""
+
+
+def _key(topic: Topic[Any], service: str) -> str:
+    return topic.key("test", service if "{" in topic.suffix else None)
+
+
+def _raw_session(bus: Bus) -> zenoh.Session:
+    """The zenoh session below a bus: what a faulty or hostile program would send with."""
+    session = bus._session  # type: ignore[attr-defined]
+    assert isinstance(session, zenoh.Session)
+    return session
+
+
+def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) -> None:
+    print(f"seed {SEED}")
+    rng = np.random.default_rng(SEED)
+    reader, writer = backend.join(Role.OBSERVER), _raw_session(backend.join(Role.OBSERVER, "hostile"))
+    subscribers = {
+        topic.suffix: reader.subscriber(topic, service=EVERY_SERVICE if "{" in topic.suffix else None)
+        for topic in TOPICS
+    }
+    publishers = {
+        topic.suffix: writer.declare_publisher(_key(topic, "mapper"), congestion_control=zenoh.CongestionControl.BLOCK)
+        for topic in TOPICS
+    }
+    assert reader.until(lambda: all(p.matching_status for p in publishers.values()) or None, timeout_s=PATIENCE_S)
+    expected: Counter[tuple[str, str]] = Counter()
+    sent: Counter[str] = Counter()
+    for number in range(MESSAGES):
+        topic = TOPICS[number % len(TOPICS)]
+        data = _mutated(rng, topic.message, number)
+        sent[topic.suffix] += 1
+        expected[topic.suffix, _verdict(topic.message, data, topic.max_bytes)] += 1
+        publishers[topic.suffix].put(data)
+    arrived = {
+        suffix: reader.until(
+            lambda s=subscriber, n=sent[suffix]: s.traffic() if s.traffic().arrived >= n else None,  # type: ignore[misc]
+            timeout_s=PATIENCE_S,
+        )
+        for suffix, subscriber in subscribers.items()
+    }
+    refused = Counter({key: count for key, count in expected.items() if key[1]})
+    assert reader.rejections() == refused
+    for suffix, traffic in arrived.items():
+        assert traffic is not None
+        assert traffic.arrived == sent[suffix]
+        assert traffic.accepted + traffic.repeated == expected[suffix, ""]
+        assert traffic.rejected == sent[suffix] - expected[suffix, ""]
+    assert sum(refused.values()) > MESSAGES // 2
+    assert len({reason for _, reason in refused}) >= 7
+    for publisher in publishers.values():
+        publisher.undeclare()
+
+
+@pytest.mark.parametrize("query", QUERIES, ids=lambda query: query.suffix)
+def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query: QueryTopic[Any, Any]) -> None:
+    print(f"seed {SEED}")
+    rng = np.random.default_rng(SEED)
+    mapper, writer = backend.join(Role.MAPPER), _raw_session(backend.join(Role.OBSERVER, "hostile"))
+    queryable = mapper.queryable(query)
+    querier = writer.declare_querier(query.key("test"), timeout=PATIENCE_S)
+    assert mapper.until(lambda: querier.matching_status or None, timeout_s=PATIENCE_S)
+    expected: Counter[tuple[str, str]] = Counter()
+    for number in range(1000):
+        data = _mutated(rng, query.request, number)
+        verdict = _verdict(query.request, data, query.max_bytes)
+        expected[query.suffix, verdict] += 1
+        replies = querier.get(payload=data)
+        if verdict:
+            assert next(iter(replies)).err is not None
+        else:
+            question = mapper.until(queryable.receive, timeout_s=PATIENCE_S)
+            assert question is not None
+            question.refuse("a test")
+    assert mapper.rejections() == {key: count for key, count in expected.items() if key[1]}
+    querier.undeclare()
+
+
+def test_a_refused_answer_is_no_answer_and_counted(backend: ZenohBackend) -> None:
+    tracker, writer = backend.join(Role.TRACKER), _raw_session(backend.join(Role.OBSERVER, "hostile"))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(SECTION_LOAD.key("test"), b"\xc1")
+
+    handler: zenoh.handlers.Callback[zenoh.Query] = zenoh.handlers.Callback(answer, indirect=False)
+    declared = writer.declare_queryable(SECTION_LOAD.key("test"), handler)
+    request = SectionRequest(section_id=1, reader="tracker")
+
+    def ended() -> str | None:
+        tracker.ask(SECTION_LOAD, request, timeout_s=1.0)
+        tracker.wait(0.2)
+        return "refused" if tracker.rejections() else None
+
+    assert tracker.until(ended, timeout_s=PATIENCE_S) == "refused"
+    assert set(tracker.rejections()) == {("section/load", "not_msgpack")}
+    declared.undeclare()

@@ -1,0 +1,31 @@
+"""A fleet's services under any order of events and any deaths: the result is always that of one process."""
+
+import pytest
+from helpers.fleet_world import expected, run_world
+
+from vtslam.common.bus_schedule import KillAt, ScriptedSchedule, SeededKills, SeededSchedule
+
+_SERVICES = ("sensor", "tracker", "mapper")
+_SEEDS = 60
+
+
+def test_undisturbed() -> None:
+    result, world = run_world(ScriptedSchedule())
+    assert result == expected()
+    assert world.deaths == []
+
+
+@pytest.mark.parametrize("name", _SERVICES)
+def test_a_death_at_every_point_of_a_service(name: str) -> None:
+    _, calm = run_world(ScriptedSchedule())
+    points = [point for service, point in calm.passed if service == name]
+    for passage in range(len(points)):
+        result, world = run_world(ScriptedSchedule(), KillAt(name, passage))
+        assert world.deaths == [(name, points[passage])]
+        assert result == expected(), f"{name} killed at {points[passage]}, passage {passage}"
+
+
+def test_any_order_with_any_deaths() -> None:
+    for seed in range(_SEEDS):
+        result, world = run_world(SeededSchedule(seed), SeededKills(seed, probability=0.03, limit=6))
+        assert result == expected(), f"seed {seed}, deaths {world.deaths}"

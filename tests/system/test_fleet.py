@@ -1,0 +1,146 @@
+"""A fleet of processes leaves what one process leaves, whichever of them dies and whenever."""
+
+import signal
+import socket
+from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
+
+import pytest
+from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
+from helpers.processes import is_gone, leftovers
+from helpers.recordings import cut_in_half
+
+from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.errors import FleetError
+from vtslam.storage.run_folder import RunFolder
+
+KILL = signal.SIGKILL
+
+
+def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_path: Path) -> None:
+    calm = Disturbance()
+    summary = fleet_run(small.files, tmp_path / "run", calm)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert (summary.frames, summary.sections, summary.interrupted) == (FRAMES, 4, False)
+    assert calm.events == []
+    assert len(calm.pids) == 3
+    assert all(is_gone(pid) for pid in calm.pids)
+    with RunFolder.open(tmp_path / "run") as run:
+        assert run.read_info().facts.finished
+        assert [row["frame_id"] for row in run.read_frames()] == list(range(FRAMES))
+
+
+def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRecording, tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    calm = Disturbance(signals=[(3, "tracker", KILL)])
+    pages: list[str] = []
+
+    def look() -> bool:
+        if calm.frames > SECTION and not pages:
+            with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as page:
+                pages.append(page.read().decode())
+        return False
+
+    plan = small_plan(small.files, f"fleet.metrics_port={port}")
+    plan.execute_in_fleet(tmp_path / "run", calm.hooks(look))
+
+    values = dict(line.rsplit(" ", 1) for line in pages[0].splitlines() if not line.startswith("#"))
+    assert float(values["vtslam_map_bytes"]) > 10_000
+    assert values['vtslam_service_deaths_total{service="tracker"}'] == "1"
+    assert values['vtslam_service_starts_total{service="mapper"}'] == "1"
+    committed = sum(int(n) for key, n in values.items() if key.startswith("vtslam_frames_committed_total"))
+    assert SECTION < committed == int(values['vtslam_frame_seconds_bucket{step="map",le="+Inf"}'])
+    with pytest.raises(URLError):
+        urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60)
+
+
+@pytest.mark.parametrize("name", ["mapper", "tracker", "sensor"])
+def test_a_process_that_is_killed_twice_changes_nothing(name: str, small: SmallRecording, tmp_path: Path) -> None:
+    killed = Disturbance(signals=[(3, name, KILL), (SECTION + 3, name, KILL)])
+    fleet_run(small.files, tmp_path / "run", killed)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert killed.deaths[name] == len(killed.events) == 2
+    assert all("killed by signal 9" in event for event in killed.events)
+    assert all(is_gone(pid) for pid in killed.pids)
+
+
+def test_deaths_within_writes_to_shared_memory_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
+    points = {
+        ("mapper", 1): "shm.active.after_rename:1",
+        ("mapper", 2): "shm.commit.after_colors:3",
+        ("mapper", 3): "shm.commit.before_flip:1",
+        ("mapper", 4): "shm.commit.after_flip:1",
+        ("mapper", 5): "shm.seal.after_tail:1",
+        ("mapper", 6): "shm.seal.after_rename:1",
+        ("sensor", 1): "shm.ring.after_color:5",
+        ("sensor", 2): "shm.ring.after_publish:3",
+    }
+    killed = Disturbance(failpoints=points)
+    fleet_run(small.files, tmp_path / "run", killed)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert (killed.deaths["mapper"], killed.deaths["sensor"], killed.deaths["tracker"]) == (6, 2, 0)
+
+
+def test_all_processes_killed_at_once_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
+    killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper")])
+    fleet_run(small.files, tmp_path / "run", killed)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert killed.deaths == {"sensor": 1, "tracker": 1, "mapper": 1}
+
+
+def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording, tmp_path: Path) -> None:
+    stopped = Disturbance(signals=[(4, "tracker", signal.SIGSTOP)])
+    fleet_run(small.files, tmp_path / "run", stopped)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert stopped.hangs == {"sensor": 0, "tracker": 1, "mapper": 0}
+    assert stopped.events == ["tracker: left the bus while it ran after 4 frames; started again"]
+
+
+def test_a_process_that_cannot_live_ends_the_fleet(small: SmallRecording, tmp_path: Path) -> None:
+    hopeless = Disturbance(failpoints={("mapper", start): "shm.commit.before_flip:1" for start in range(1, 9)})
+    with pytest.raises(FleetError, match="mapper: killed by signal 9 after 0 frames, for the 6th time"):
+        fleet_run(small.files, tmp_path / "run", hopeless)
+
+    assert all(is_gone(pid) for pid in hopeless.pids)
+    assert leftovers() == []
+
+
+def test_what_was_done_before_a_stop_is_kept(small: SmallRecording, tmp_path: Path) -> None:
+    calm = Disturbance()
+    summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames > SECTION)
+
+    assert summary.interrupted
+    assert SECTION < summary.frames < FRAMES
+    with RunFolder.open(tmp_path / "run") as run:
+        facts, poses = run.read_info().facts, read_trajectory(run.trajectory_path).poses
+        in_sections = sum(run.read_section(section_id).num_frames for section_id in run.section_ids())
+    assert (facts.finished, facts.interrupted) == (False, True)
+    assert facts.frames == len(poses) == in_sections == summary.frames
+    files = result_bytes(tmp_path / "run")
+    assert files["000000.vts"] == small.undisturbed["000000.vts"]
+    assert small.undisturbed["trajectory.txt"].startswith(files["trajectory.txt"])
+
+
+def test_a_frame_that_cannot_be_read_ends_the_run_with_what_was_read(small: SmallRecording, tmp_path: Path) -> None:
+    path = small.files.color_path(SECTION + 2)
+    whole = path.read_bytes()
+    plan = small_plan(small.files)
+    cut_in_half(path)
+    try:
+        with pytest.raises(SourceError, match=path.name):
+            plan.execute(tmp_path / "one")
+        with pytest.raises(SourceError, match=path.name):
+            plan.execute_in_fleet(tmp_path / "many", Disturbance().hooks())
+    finally:
+        path.write_bytes(whole)
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
