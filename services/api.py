@@ -22,7 +22,7 @@ def run(
     on_frame: Callable[[FrameFacts], None] = lambda facts: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
-    """Track and map a recording, as ``vtslam run`` does.
+    """Track and map a recording, as ``vtslam run --in-process`` does.
 
     Args:
         source: Where frames come from, as in ``replica:DIR`` or ``sim:room``.

@@ -15,6 +15,7 @@ _MODULE = "vtslam.services.supervisor.child"
 _MAX_DEATHS = 5  # without a commit in between
 _BACK_OFF_S = (0.0, 0.0, 0.2, 0.5, 1.0, 2.0)  # before a start, by such deaths
 _MISSING_S = 3.0  # without a token on the bus although the process runs: it is stopped as a whole
+_START_S = 120.0  # to the first heartbeat
 _READY = frozenset(set(ServiceState) - {ServiceState.STARTING})
 
 
@@ -112,8 +113,8 @@ class ChildProcess:
             return None
         if now_s - self._present_s > _MISSING_S:
             why = "left the bus while it ran"
-        elif now_s - self._heard_s > self._hang_s:
-            why = f"silent for {self._hang_s:g} s"
+        elif now_s - self._heard_s > (limit_s := _START_S if self.status is None else self._hang_s):
+            why = f"silent for {limit_s:g} s"
         else:
             return None
         self.kill()

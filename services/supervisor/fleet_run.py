@@ -57,7 +57,7 @@ def run_in_fleet(
 
     Raises:
         SourceError: A frame cannot be read; what was done before it is kept.
-        FleetError: A process cannot be kept alive, or the port for metrics is taken.
+        FleetError: A process cannot be kept alive, or the port for metrics is taken; sections written so far are kept.
         SharedMemoryError, BusError, PrivateFolderError: Shared memory or bus cannot be set up.
         StorageError: The run folder cannot be written.
     """

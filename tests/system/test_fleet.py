@@ -10,8 +10,10 @@ import pytest
 from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
 from helpers.processes import is_gone, leftovers
 from helpers.recordings import cut_in_half
+from helpers.shared_data import shared_data
 
 from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.run_folder import RunFolder
@@ -31,6 +33,16 @@ def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_
     with RunFolder.open(tmp_path / "run") as run:
         assert run.read_info().facts.finished
         assert [row["frame_id"] for row in run.read_frames()] == list(range(FRAMES))
+
+
+def test_a_kinect_recording_with_default_settings_gives_the_same_bytes(tmp_path: Path) -> None:
+    recording = shared_data("redkitchen")
+    words = ["source.frames=0:10", "source.size=80x60", "section.length=4"]
+    plan = plan_run(f"replica:{recording}", family="tum", assignments=words)
+    plan.execute(tmp_path / "one")
+    plan.execute_in_fleet(tmp_path / "many", Disturbance().hooks())
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
 
 
 def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRecording, tmp_path: Path) -> None:
