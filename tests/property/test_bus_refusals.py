@@ -12,11 +12,13 @@ from helpers.bus_backends import ZenohBackend, zenoh_backend
 from helpers.bus_messages import MAX_BYTES, RANDOM
 
 from vtslam.common.bus import Bus
+from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.messages import Message, MessageError, SectionRequest, decode, encode
 from vtslam.common.topics import EVERY_SERVICE, QUERIES, SECTION_LOAD, TOPICS, QueryTopic, Role, Topic
 
 SEED = 20_26
 MESSAGES = 20_000
+IN_FLIGHT = 100
 PATIENCE_S = 60.0
 FEW_BYTES = 4096  # of a made-up message; pixels are small here as well
 
@@ -92,6 +94,10 @@ def _mutated(rng: np.random.Generator, kind: type[Message], number: int) -> byte
     return MUTATIONS[int(rng.integers(len(MUTATIONS)))](rng, data)
 
 
+def _all_arrived(subscribers: dict[str, Subscriber[Any]], sent: Counter[str]) -> bool | None:
+    return all(subscribers[suffix].traffic().arrived >= count for suffix, count in sent.items()) or None
+
+
 def _verdict(kind: type[Message], data: bytes, max_bytes: int) -> str:
     """The reason of refusal, or nothing; anything else that is raised fails the test."""
     try:
@@ -133,17 +139,14 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
         sent[topic.suffix] += 1
         expected[topic.suffix, _verdict(topic.message, data, topic.max_bytes)] += 1
         publishers[topic.suffix].put(data)
-    arrived = {
-        suffix: reader.until(
-            lambda s=subscriber, n=sent[suffix]: s.traffic() if s.traffic().arrived >= n else None,  # type: ignore[misc]
-            timeout_s=PATIENCE_S,
-        )
-        for suffix, subscriber in subscribers.items()
-    }
+        if number % IN_FLIGHT == IN_FLIGHT - 1:
+            # Zenoh may drop what a busy machine leaves unread for a second; few under way at once never are.
+            assert reader.until(lambda: _all_arrived(subscribers, sent), timeout_s=PATIENCE_S)
+    assert reader.until(lambda: _all_arrived(subscribers, sent), timeout_s=PATIENCE_S)
+    arrived = {suffix: subscriber.traffic() for suffix, subscriber in subscribers.items()}
     refused = Counter({key: count for key, count in expected.items() if key[1]})
     assert reader.rejections() == refused
     for suffix, traffic in arrived.items():
-        assert traffic is not None
         assert traffic.arrived == sent[suffix]
         assert traffic.accepted + traffic.repeated == expected[suffix, ""]
         assert traffic.rejected == sent[suffix] - expected[suffix, ""]
@@ -159,21 +162,31 @@ def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query:
     rng = np.random.default_rng(SEED)
     mapper, writer = backend.join(Role.MAPPER), _raw_session(backend.join(Role.OBSERVER, "hostile"))
     queryable = mapper.queryable(query)
-    querier = writer.declare_querier(query.key("test"), timeout=PATIENCE_S)
+    querier = writer.declare_querier(
+        query.key("test"), timeout=PATIENCE_S, congestion_control=zenoh.CongestionControl.BLOCK
+    )
     assert mapper.until(lambda: querier.matching_status or None, timeout_s=PATIENCE_S)
+    refusals = 0
     expected: Counter[tuple[str, str]] = Counter()
     for number in range(1000):
         data = _mutated(rng, query.request, number)
         verdict = _verdict(query.request, data, query.max_bytes)
         expected[query.suffix, verdict] += 1
-        replies = querier.get(payload=data)
         if verdict:
-            assert next(iter(replies)).err is not None
+            # A reply may be lost on a busy machine; the asker then gets none, which it must bear with anyway.
+            refusals += sum(reply.err is not None for reply in querier.get(payload=data))
+            key, count = (query.suffix, verdict), expected[query.suffix, verdict]
+            counted = mapper.until(lambda: mapper.rejections().get(key) == count or None, timeout_s=PATIENCE_S)  # noqa: B023
+            assert counted, f"question {number}, {verdict}, was not counted"
         else:
+            replies = querier.get(payload=data)
             question = mapper.until(queryable.receive, timeout_s=PATIENCE_S)
             assert question is not None
             question.refuse("a test")
-    assert mapper.rejections() == {key: count for key, count in expected.items() if key[1]}
+            assert len(list(replies)) <= 1
+    refused = {key: count for key, count in expected.items() if key[1]}
+    assert mapper.rejections() == refused
+    assert 0.95 * sum(refused.values()) <= refusals <= sum(refused.values())
     querier.undeclare()
 
 
