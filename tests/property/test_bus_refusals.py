@@ -19,6 +19,7 @@ from vtslam.common.topics import EVERY_SERVICE, QUERIES, SECTION_LOAD, TOPICS, Q
 SEED = 20_26
 MESSAGES = 20_000
 IN_FLIGHT = 100
+LOST_AFTER_S = 5.0
 PATIENCE_S = 60.0
 FEW_BYTES = 4096  # of a made-up message; pixels are small here as well
 
@@ -94,8 +95,14 @@ def _mutated(rng: np.random.Generator, kind: type[Message], number: int) -> byte
     return MUTATIONS[int(rng.integers(len(MUTATIONS)))](rng, data)
 
 
-def _all_arrived(subscribers: dict[str, Subscriber[Any]], sent: Counter[str]) -> bool | None:
-    return all(subscribers[suffix].traffic().arrived >= count for suffix, count in sent.items()) or None
+def _wait_for_all(reader: Bus, subscribers: dict[str, Subscriber[Any]], sent: Counter[str], lost: Counter[str]) -> None:
+    """Wait until all that was sent has arrived; what has not after a while is lost."""
+
+    def missing() -> Counter[str]:
+        return Counter({suffix: sent[suffix] - each.traffic().arrived for suffix, each in subscribers.items()})
+
+    if not reader.until(lambda: missing() == lost or None, timeout_s=LOST_AFTER_S):
+        lost.update(missing() - lost)
 
 
 def _verdict(kind: type[Message], data: bytes, max_bytes: int) -> str:
@@ -133,6 +140,7 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
     assert reader.until(lambda: all(p.matching_status for p in publishers.values()) or None, timeout_s=PATIENCE_S)
     expected: Counter[tuple[str, str]] = Counter()
     sent: Counter[str] = Counter()
+    lost: Counter[str] = Counter()
     for number in range(MESSAGES):
         topic = TOPICS[number % len(TOPICS)]
         data = _mutated(rng, topic.message, number)
@@ -140,16 +148,21 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
         expected[topic.suffix, _verdict(topic.message, data, topic.max_bytes)] += 1
         publishers[topic.suffix].put(data)
         if number % IN_FLIGHT == IN_FLIGHT - 1:
-            # Zenoh may drop what a busy machine leaves unread for a second; few under way at once never are.
-            assert reader.until(lambda: _all_arrived(subscribers, sent), timeout_s=PATIENCE_S)
-    assert reader.until(lambda: _all_arrived(subscribers, sent), timeout_s=PATIENCE_S)
-    arrived = {suffix: subscriber.traffic() for suffix, subscriber in subscribers.items()}
+            _wait_for_all(reader, subscribers, sent, lost)
+    _wait_for_all(reader, subscribers, sent, lost)
+    # Zenoh itself drops a message now and then on a busy machine. What did arrive is accounted for, to the last one.
+    assert lost.total() <= MESSAGES // 1000
     refused = Counter({key: count for key, count in expected.items() if key[1]})
-    assert reader.rejections() == refused
-    for suffix, traffic in arrived.items():
-        assert traffic.arrived == sent[suffix]
-        assert traffic.accepted + traffic.repeated == expected[suffix, ""]
-        assert traffic.rejected == sent[suffix] - expected[suffix, ""]
+    counted = reader.rejections()
+    assert set(counted) <= set(refused)
+    for suffix, subscriber in subscribers.items():
+        traffic = subscriber.traffic()
+        missing = {key: refused[key] - counted.get(key, 0) for key in refused if key[0] == suffix}
+        missing[suffix, ""] = expected[suffix, ""] - traffic.accepted - traffic.repeated
+        assert min(missing.values()) >= 0
+        assert sum(missing.values()) == lost[suffix]
+        assert traffic.arrived == sent[suffix] - lost[suffix]
+        assert traffic.rejected == sum(count for key, count in counted.items() if key[0] == suffix)
     assert sum(refused.values()) > MESSAGES // 2
     assert len({reason for _, reason in refused}) >= 7
     for publisher in publishers.values():
