@@ -50,14 +50,10 @@ class Exposure:
         """Map colours float32 [...,3] as the frame shows them."""
         return colors if self.is_identity else colors * self.gain + self.offset
 
-    def removed(self, colors: _Image) -> _Image:
-        """A frame's colours float32 [...,3] in the map's gauge."""
-        return colors if self.is_identity else (colors - self.offset) / self.gain
-
-    def removed_from(self, rgb: npt.NDArray[np.uint8]) -> _Image:
+    def removed(self, rgb: npt.NDArray[np.uint8]) -> _Image:
         """A frame's image uint8 [H,W,3] in the map's gauge, float32."""
         levels = np.arange(256, dtype=np.float32)[:, None] * np.float32(1.0 / 255.0)
-        table = self.removed(np.repeat(levels, 3, axis=1))
+        table = (levels - self.offset) / self.gain
         return np.asarray(cv2.LUT(rgb, table[:, None]), np.float32)
 
     def nearer_to_identity(self, share: float) -> "Exposure":

@@ -159,7 +159,7 @@ def tied_to_frame(
         Colour as observed in the map's gauge, sigma = radius_factor * depth / focal length (Eq. 3), halved for the edge
         supplement.
     """
-    rgb = (exposure or Exposure.identity()).removed(frame.rgb_float())
+    rgb = (exposure or Exposure.identity()).removed(frame.rgb)
     pixels = np.flatnonzero(mask & (frame.depth > 0)).astype(np.int32)
     subpixel = np.zeros(pixels.size, np.uint8)
     if edges is not None:

@@ -32,9 +32,8 @@ def _moments_of(shape: tuple[int, ...], rate: float, epsilon: float, previous: A
     """Adam's state for one attribute: a copy of the previous state with zero rows appended, or all zero."""
     adam = Adam(shape, lr=rate, eps=epsilon)
     if previous is not None:
-        kept = previous.m.shape[0]
-        adam.m[:kept], adam.v[:kept] = previous.m, previous.v
-        adam.step_count = previous.step_count
+        adam.m, adam.v, adam.step_count = previous.m, previous.v, previous.step_count
+        adam.grow(shape[0] - previous.m.shape[0])  # in memory of its own
     return adam
 
 
@@ -195,7 +194,7 @@ class SectionOptimiser:
         loss = mapping_loss(
             rendering.rgb,
             rendering.depth_m,
-            view.exposure.removed_from(view.frame.rgb),
+            view.exposure.removed(view.frame.rgb),
             view.frame.depth_m(),
             weight_color=self._settings.color_weight,
             weight_depth=self._settings.depth_weight,

@@ -78,7 +78,7 @@ class Tracker:
             frame that cannot be tracked keeps its guess and is called lost.
         """
         T_guess = state.constant_velocity_guess() if guess is None else guess
-        usable, rgb = self._usable(frame, state), state.exposure.removed(frame.rgb_float())
+        usable, rgb = self._usable(frame, state), state.exposure.removed(frame.rgb)
         candidates = self._sections_to_try(frame, T_guess, map_reader, section_id, is_head)
         attempt = self._attempt(frame, usable, candidates, T_guess, section_id, is_head, prior, rgb)
         rescued = False

@@ -36,11 +36,13 @@ def rendered(section: Section, index: int) -> Rendering:
     return NativeEngine(threads=1).render(section.splats, section.camera, T_camera_section)
 
 
-def test_applying_and_removing_are_inverse_and_the_identity_copies_nothing() -> None:
-    colors = room_frame(0).rgb_float()
-    np.testing.assert_allclose(WARM.removed(WARM.applied(colors)), colors, atol=1e-6)
+def test_applying_and_removing_are_inverse_and_the_identity_changes_nothing() -> None:
+    frame = room_frame(0)
+    colors = frame.rgb_float()
+    np.testing.assert_allclose(WARM.applied(WARM.removed(frame.rgb)), colors, atol=1e-6)
+    np.testing.assert_array_equal(WARM.removed(frame.rgb), (colors - WARM.offset) / WARM.gain)
     assert IDENTITY.applied(colors) is colors
-    assert IDENTITY.removed(colors) is colors
+    assert IDENTITY.removed(frame.rgb).tobytes() == colors.tobytes()
 
 
 def test_an_exposure_is_found_again_though_a_third_of_the_pixels_disagree() -> None:

@@ -8,6 +8,8 @@ from helpers.smooth_room import SmoothRoom, small_camera
 
 from vtslam.common.gaussians import tied_to_frame
 from vtslam.common.geometry import se3
+from vtslam.common.geometry.camera import Camera
+from vtslam.common.optim.surface import measured_surface
 from vtslam.common.section import Section, SectionFrame, joined_splats
 from vtslam.common.splat.native_engine import NativeEngine
 
@@ -129,3 +131,13 @@ def test_a_section_far_from_the_worlds_origin_renders_the_same() -> None:
         joined = joined_splats(sections, into=sections[1])
         images.append(engine.render(joined, CAMERA, np.eye(4)).rgb)
     np.testing.assert_allclose(images[1], images[0], atol=2e-4)
+
+
+def test_wider_images_have_no_more_surface_points() -> None:
+    counts = []
+    for width in (320, 640, 1280):
+        camera = Camera(width=width, height=width * 3 // 4, fx=width, fy=width, cx=width / 2, cy=width * 3 / 8)
+        wall = np.full((camera.height, camera.width), 2000, np.uint16)
+        counts.append(len(measured_surface(wall, camera, np.eye(4), depth_scale_m=0.001)))
+    assert counts[0] > 0.9 * 160 * 120
+    assert max(counts) < 1.05 * min(counts)

@@ -1,6 +1,6 @@
 """The whole system in one process, with an archive in memory."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -65,6 +65,17 @@ def settings_of(*assignments: str, preset: str = "fast") -> Settings:
 
 def room_frames() -> list[Frame]:
     return [room_frame(i, PATH) for i in range(FRAMES)]
+
+
+@dataclass(slots=True)
+class SlowClock:
+    """Another second at each look."""
+
+    now_s: float = 0.0
+
+    def __call__(self) -> float:
+        self.now_s += 1.0
+        return self.now_s
 
 
 def run(
@@ -243,3 +254,11 @@ def test_reports_count_the_work_and_read_the_clock() -> None:
         np.cumsum([report.commit.gaussians_added for report in reports])
     )
     assert all(report.commit.renders > 0 for report in reports)
+
+
+def test_a_time_budget_ends_the_steps_of_a_frame_but_not_before_the_first() -> None:
+    settings = settings_of("mapper.enough_loss=0")
+    for budget_s, steps in ((0.0, [8, 3, 3]), (1.5, [1, 1, 1]), (2.5, [2, 2, 2])):
+        limited = replace(settings, mapper=replace(settings.mapper, budget_s=budget_s))
+        system = System(limited, NativeEngine(threads=1), MemoryArchive(), threads=1, clock=SlowClock())
+        assert [system.process(frame).commit.iterations for frame in room_frames()[:3]] == steps
