@@ -17,7 +17,7 @@ _Image = npt.NDArray[np.float32]
 
 _MIN_ALPHA = 0.95
 _DEPTH_AGREEMENT = 0.03  # of the depth: pixels where map and frame show the same surface
-_SATURATED = 0.97
+_SATURATED = 248  # of 255
 _MIN_SHARE = 0.02  # of the frame's pixels: fewer say too little
 _SAMPLES = 8_000  # pixels used; more change nothing
 _ROUNDS = 6
@@ -72,15 +72,17 @@ def estimated_exposure(rendering: Rendering, frame: Frame, fallback: Exposure) -
         frame: The frame.
         fallback: Taken where too few pixels agree.
     """
-    rgb, depth_m = frame.rgb_float(), frame.depth_m()
-    usable = (frame.depth > 0) & (rendering.alpha > _MIN_ALPHA) & (rgb.max(axis=2) < _SATURATED)
+    depth_m = frame.depth_m()
+    usable = (frame.depth > 0) & (rendering.alpha > _MIN_ALPHA)
     usable &= np.abs(rendering.depth_m - depth_m) < _DEPTH_AGREEMENT * depth_m
+    for channel in range(3):
+        usable &= frame.rgb[..., channel] < _SATURATED
     chosen = np.flatnonzero(usable)
     if chosen.size < _MIN_SHARE * usable.size:
         return fallback
     chosen = chosen[:: max(chosen.size // _SAMPLES, 1)]
     shown = rendering.rgb.reshape(-1, 3)[chosen].astype(np.float64)
-    seen = rgb.reshape(-1, 3)[chosen].astype(np.float64)
+    seen = frame.rgb.reshape(-1, 3)[chosen] / 255.0
     lines = [_line_through(shown[:, channel], seen[:, channel]) for channel in range(3)]
     gain, offset = np.array(lines, np.float32).T
     return Exposure(gain=np.clip(gain, *_GAINS), offset=np.clip(offset, *_OFFSETS))
@@ -91,10 +93,12 @@ def _line_through(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tup
     weights = np.ones_like(x)
     gain, offset = 1.0, 0.0
     for _ in range(_ROUNDS):
-        mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
+        total = weights.sum()
+        mean_x, mean_y = weights @ x / total, weights @ y / total
         dx, dy = x - mean_x, y - mean_y
-        variance = np.average(dx * dx, weights=weights)
-        gain = float(np.average(dx * dy, weights=weights) / variance) if variance > 1e-4 else 1.0
+        weighted = weights * dx
+        variance = weighted @ dx / total
+        gain = float(weighted @ dy / total / variance) if variance > 1e-4 else 1.0
         offset = float(mean_y - gain * mean_x)
         error = dy - gain * dx
         scale = 1.5 * float(np.median(np.abs(error))) + 1e-6

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
+from vtslam.common.rows import thinned
 from vtslam.common.splat.engine import Splats
 
 # Offset of a Gaussian from its pixel's centre in pixels, by ``subpixel``: 0 is the pixel itself, 1 to 4 the four
@@ -66,9 +67,9 @@ class ViewTiedGaussians:
             **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
         )
 
-    def selected(self, rows: npt.NDArray[np.intp]) -> "ViewTiedGaussians":
-        """The Gaussians of ``rows``, indices [M]."""
-        return ViewTiedGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+    def thinned(self, kept: npt.NDArray[np.bool_]) -> "ViewTiedGaussians":
+        """Without those of the last rows that are not ``kept`` (bool [M])."""
+        return ViewTiedGaussians(**{f.name: thinned(getattr(self, f.name), kept) for f in fields(self)})
 
     def rows_from(self, first: int) -> "ViewTiedGaussians":
         """The Gaussians from row ``first`` on."""

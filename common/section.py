@@ -10,6 +10,7 @@ from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim.surface import measured_surface
+from vtslam.common.rows import thinned
 from vtslam.common.splat.engine import Splats
 
 
@@ -75,9 +76,18 @@ class Section:
             surface=np.concatenate([self.surface, self._surface_of(frame)]),
         )
 
-    def selected(self, rows: npt.NDArray[np.intp]) -> "Section":
-        """The section with the Gaussians of ``rows``, indices [M]."""
-        return replace(self, gaussians=self.gaussians.selected(rows), means_m=self.means_m[rows])
+    def finished(self, last: int, view_depth: npt.NDArray[np.uint16]) -> "Section":
+        """The section as it will be read back, to the bit; frame ``last`` keeps its depth, and none after it does."""
+        frames, surface = list(self.frames), self.surface
+        if frames[last].view_depth is None:
+            frames[last] = replace(frames[last], view_depth=view_depth)
+            surface = np.concatenate([surface, self._surface_of(frames[last])])
+        # Positions anew: the last bits of a product of matrices may depend on the number of rows.
+        return replace(self, frames=tuple(frames), means_m=self._means_of(self.gaussians), surface=surface)
+
+    def thinned(self, kept: npt.NDArray[np.bool_]) -> "Section":
+        """Without those of the last Gaussians that are not ``kept`` (bool [M])."""
+        return replace(self, gaussians=self.gaussians.thinned(kept), means_m=thinned(self.means_m, kept))
 
     def continued(self, earlier: "Section") -> "Section":
         """As :meth:`retied`, with the parts that a former state of the section already has taken from there."""

@@ -12,6 +12,7 @@ from vtslam.common.config import Range
 Positive = Annotated[float, Range(0.0, low_open=True)]
 NonNegative = Annotated[float, Range(0.0)]
 Fraction = Annotated[float, Range(0.0, 1.0)]
+Decay = Annotated[float, Range(0.0, 0.99999)]
 Count = Annotated[int, Range(0)]
 PositiveCount = Annotated[int, Range(1)]
 
@@ -194,6 +195,8 @@ class MapperSettings:
         learning_rate_color: Adam's rate of colours.
         learning_rate_log_radius: ... of log radii.
         learning_rate_opacity: ... of opacity logits.
+        adam_momentum: Decay of Adam's first moment; few steps want a small one.
+        adam_memory: Decay of its second moment.
         adam_epsilon: Adam's epsilon; a larger one keeps Gaussians that hardly show where they started.
         radius_limit: Largest factor between a radius and its first value; 0 for none.
         keep_moments: Keep Adam's moments from frame to frame of a section.
@@ -210,6 +213,8 @@ class MapperSettings:
         edge_low: Lower Canny threshold.
         edge_high: Upper Canny threshold.
         least_weight: A new Gaussian whose blending weights in its own frame add up to less (pixels) goes; 0 keeps all.
+        least_weight_sealed: When a section is finished, a Gaussian whose weights add up to less in each of its frames
+            goes; 0 keeps all.
         uncovered_silhouette: Pixels with a smaller silhouette get Gaussians.
         uncovered_depth_factor: So do those whose rendered depth lies behind by this many median errors; 0 never.
         uncovered_color_error: So do those whose mean channel difference is larger than this; 0 never.
@@ -227,6 +232,8 @@ class MapperSettings:
     learning_rate_color: NonNegative = 0.0025
     learning_rate_log_radius: NonNegative = 0.005
     learning_rate_opacity: NonNegative = 0.05
+    adam_momentum: Decay = 0.9
+    adam_memory: Decay = 0.999
     adam_epsilon: Positive = 1e-15
     radius_limit: NonNegative = 0.0
     keep_moments: bool = False
@@ -243,6 +250,7 @@ class MapperSettings:
     edge_low: NonNegative = 50.0
     edge_high: NonNegative = 200.0
     least_weight: NonNegative = 0.0
+    least_weight_sealed: NonNegative = 0.0
     uncovered_silhouette: Fraction = 0.5
     uncovered_depth_factor: NonNegative = 50.0
     uncovered_color_error: NonNegative = 0.0

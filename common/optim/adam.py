@@ -3,6 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.rows import thinned
 from vtslam.common.splat import _native
 from vtslam.common.splat.engine import FloatArray
 from vtslam.common.splat.native_engine import checked
@@ -49,9 +50,9 @@ class Adam:
         self.m = np.concatenate([self.m, added])
         self.v = np.concatenate([self.v, added])
 
-    def select(self, rows: npt.NDArray[np.intp]) -> None:
-        """Keep ``rows``, indices [M]."""
-        self.m, self.v = self.m[rows], self.v[rows]
+    def thin(self, kept: npt.NDArray[np.bool_]) -> None:
+        """Leave out those of the last rows that are not ``kept`` (bool [M])."""
+        self.m, self.v = thinned(self.m, kept), thinned(self.v, kept)
 
     def step(self, parameters: FloatArray, gradients: FloatArray, *, rate: float = 1.0) -> None:
         """Move ``parameters`` in place a step of ``rate * lr`` against ``gradients`` (float32, shape of the state).

@@ -215,9 +215,10 @@ def align(
     T_observed_reference: npt.NDArray[np.float64],
     prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None = None,
     coarsest: int,
+    finest: int = 0,
     threads: int = 1,
 ) -> Alignment:
-    """Move the frame's camera until the rendered surface agrees with the frame, from level ``coarsest`` to 0.
+    """Move the frame's camera until the rendered surface agrees with the frame, from level ``coarsest`` to ``finest``.
 
     Args:
         reference: The rendered view.
@@ -226,11 +227,13 @@ def align(
         T_observed_reference: float64 [4,4], first guess.
         prior: (pose it asks for, information [6,6]) or None.
         coarsest: Level to start at.
+        finest: Level to end at; the coarsest there is, if it has fewer.
         threads: Threads of the kernel; the result does not depend on it.
     """
     T = T_observed_reference
     system: _System | None = None
-    for level in range(min(coarsest, len(reference.levels) - 1, len(observed.levels) - 1), -1, -1):
+    first = min(coarsest, len(reference.levels) - 1, len(observed.levels) - 1)
+    for level in range(first, min(finest, first) - 1, -1):
         T, system = _solved_level(reference, observed, level, T, settings, prior, threads)
     assert system is not None
     return Alignment(

@@ -4,7 +4,7 @@ Pure: no bus, clock or files. Random choices are keyed by (seed, frame), so a re
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -146,13 +146,11 @@ class Mapper:
         key = self._section_key(active.section)
         chosen = self._even_views(key, len(active.views), count)
         rates = np.geomspace(self.settings.seal_rate_first, self.settings.seal_rate_last, count)
-        result = self._optimised(active.section, neighbours, active, active.views, chosen, rates=rates)
+        watched = len(active.views) if self.settings.least_weight_sealed > 0 else 0
+        result = self._optimised(active.section, neighbours, active, active.views, chosen, rates=rates, watched=watched)
         section = result.section
         last = active.views[-1]
-        frames = list(section.frames)
-        frames[last.frame_index] = replace(frames[last.frame_index], view_depth=last.frame.depth)
-        # Computed anew, so that a section in memory and the same one read back agree to the bit.
-        return replace(section, frames=tuple(frames)).retied(), result.renders
+        return section.finished(last.frame_index, last.frame.depth), result.renders
 
     def _optimised(
         self,
@@ -164,9 +162,22 @@ class Mapper:
         *,
         rates: npt.NDArray[np.float64],
         drop_hidden: bool = False,
+        watched: int = 0,
         in_time: Callable[[], bool] = lambda: True,
     ) -> Optimised:
-        """The section after a step on each of the chosen views; at the first one hidden Gaussians may be dropped."""
+        """The section after a step on each of the chosen views.
+
+        Args:
+            section: Of what ``active`` has become.
+            neighbours: For the joint loss.
+            active: Its optimiser state goes on.
+            views: The section's.
+            chosen: Indices into ``views``, a step each.
+            rates: Of each step.
+            drop_hidden: Whether the first step leaves out hidden Gaussians of its view.
+            watched: After so many steps those that showed too little in them are left out; 0 never.
+            in_time: Whether there is time for another step; asked from the second one on.
+        """
         optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
         if section.gaussians.count:
             for step, (index, rate) in enumerate(zip(chosen, rates, strict=True)):
@@ -178,7 +189,10 @@ class Mapper:
                     with_neighbours=index == 0,
                     rate=float(rate),
                     drop_hidden=drop_hidden and step == 0,
+                    watch=step < watched,
                 )
+                if step + 1 == watched:
+                    optimiser.drop_unseen()
         return optimiser.finished()
 
     def _section_frame(

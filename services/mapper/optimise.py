@@ -9,6 +9,7 @@ from vtslam.common.gaussians import first_log_radii
 from vtslam.common.geometry import se3
 from vtslam.common.optim.adam import Adam
 from vtslam.common.optim.mapping_loss import mapping_loss
+from vtslam.common.rows import thinned
 from vtslam.common.section import Section, joined_splats
 from vtslam.common.settings import MapperSettings
 from vtslam.common.splat.engine import Engine, Gradients, Splats
@@ -28,9 +29,9 @@ class Optimised:
     renders: int
 
 
-def _moments_of(shape: tuple[int, ...], rate: float, epsilon: float, previous: Adam | None) -> Adam:
+def _moments_of(shape: tuple[int, ...], rate: float, settings: MapperSettings, previous: Adam | None) -> Adam:
     """Adam's state for one attribute: a copy of the previous state with zero rows appended, or all zero."""
-    adam = Adam(shape, lr=rate, eps=epsilon)
+    adam = Adam(shape, lr=rate, betas=(settings.adam_momentum, settings.adam_memory), eps=settings.adam_epsilon)
     if previous is not None:
         adam.m, adam.v, adam.step_count = previous.m, previous.v, previous.step_count
         adam.grow(shape[0] - previous.m.shape[0])  # in memory of its own
@@ -42,12 +43,10 @@ def _new_moments(section: Section, settings: MapperSettings, previous: Moments |
     g, s = section.gaussians, settings
     kept = previous if settings.keep_moments else None
     return Moments(
-        colors=_moments_of(g.colors.shape, s.learning_rate_color, s.adam_epsilon, kept.colors if kept else None),
-        log_radii=_moments_of(
-            g.log_radii.shape, s.learning_rate_log_radius, s.adam_epsilon, kept.log_radii if kept else None
-        ),
+        colors=_moments_of(g.colors.shape, s.learning_rate_color, s, kept.colors if kept else None),
+        log_radii=_moments_of(g.log_radii.shape, s.learning_rate_log_radius, s, kept.log_radii if kept else None),
         opacity_logits=_moments_of(
-            g.opacity_logits.shape, s.learning_rate_opacity, s.adam_epsilon, kept.opacity_logits if kept else None
+            g.opacity_logits.shape, s.learning_rate_opacity, s, kept.opacity_logits if kept else None
         ),
     )
 
@@ -80,9 +79,16 @@ class SectionOptimiser:
         )
         span = np.float32(np.log(max(settings.radius_limit, 1.0)))
         self._log_radius_bounds = (first - span, first + span)
+        self._most_weight = np.zeros(g.count, np.float32)
 
     def step(
-        self, view: TrainingView, *, with_neighbours: bool, rate: float = 1.0, drop_hidden: bool = False
+        self,
+        view: TrainingView,
+        *,
+        with_neighbours: bool,
+        rate: float = 1.0,
+        drop_hidden: bool = False,
+        watch: bool = False,
     ) -> npt.NDArray[np.float64]:
         """One step on ``view``: Eq. 2 on the section alone, and if asked on the section with its neighbours.
 
@@ -90,16 +96,18 @@ class SectionOptimiser:
             view: The frame rendered against.
             with_neighbours: Whether to add the joint loss.
             rate: Factor on the learning rates.
-            drop_hidden: Afterwards leave out the view's own Gaussians that others cover there (``least_weight``).
+            drop_hidden: Afterwards leave out the view's own Gaussians that others cover there (``least_weight``); they
+                must be the section's last.
+            watch: Note how much each Gaussian shows, for :meth:`drop_unseen`.
 
         Returns:
             The gradient [6] of the joint loss with respect to a left twist on the section's own camera pose relative
             to its neighbours (zero without neighbours): what bundle adjustment of a head descends along.
         """
         T_camera_section = se3.inverse(self._section.frames[view.frame_index].T_section_frame)
-        want_weights = drop_hidden and self._settings.least_weight > 0
+        drop_hidden = drop_hidden and self._settings.least_weight > 0
         gradients, value = self._loss_gradients(
-            self._splats(), view, T_camera_section, want_means=False, want_weights=want_weights
+            self._splats(), view, T_camera_section, want_means=False, want_weights=drop_hidden or watch
         )
         colors, log_radii, opacity_logits = gradients.colors, gradients.log_radii, gradients.opacity_logits
         pose_gradient = np.zeros(6)
@@ -115,11 +123,17 @@ class SectionOptimiser:
             pose_gradient = _camera_twist_gradient(joined, joint, own, T_camera_section)
         self._losses.append(value)
         self._move(colors, log_radii, opacity_logits, rate)
-        if want_weights:
+        if gradients.weights is not None:
+            np.maximum(self._most_weight, gradients.weights, out=self._most_weight)
+        if drop_hidden:
             assert gradients.weights is not None
-            tied_to_view = self._section.gaussians.frame_index == view.frame_index
-            self._keep(np.flatnonzero(~tied_to_view | (gradients.weights >= self._settings.least_weight)))
+            own_rows = np.count_nonzero(self._section.gaussians.frame_index == view.frame_index)
+            self._thin(gradients.weights[gradients.weights.size - own_rows :] >= self._settings.least_weight)
         return pose_gradient
+
+    def drop_unseen(self) -> None:
+        """Leave out the Gaussians that showed too little in every view watched (``least_weight_sealed``)."""
+        self._thin(self._most_weight >= self._settings.least_weight_sealed)
 
     def _move(
         self,
@@ -135,17 +149,18 @@ class SectionOptimiser:
         if self._settings.radius_limit > 0:
             np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
 
-    def _keep(self, rows: npt.NDArray[np.intp]) -> None:
-        """Leave out all Gaussians but those of ``rows``."""
-        if rows.size == self._log_radii.size:
+    def _thin(self, kept: npt.NDArray[np.bool_]) -> None:
+        """Leave out those of the last Gaussians that are not ``kept`` (bool [M])."""
+        if kept.all():
             return
-        self._section = self._section.selected(rows)
-        self._colors, self._log_radii = self._colors[rows], self._log_radii[rows]
-        self._opacity_logits = self._opacity_logits[rows]
+        self._section = self._section.thinned(kept)
+        self._colors, self._log_radii = thinned(self._colors, kept), thinned(self._log_radii, kept)
+        self._opacity_logits = thinned(self._opacity_logits, kept)
         low, high = self._log_radius_bounds
-        self._log_radius_bounds = (low[rows], high[rows])
+        self._log_radius_bounds = (thinned(low, kept), thinned(high, kept))
+        self._most_weight = thinned(self._most_weight, kept)
         for moments in (self._moments.colors, self._moments.log_radii, self._moments.opacity_logits):
-            moments.select(rows)
+            moments.thin(kept)
 
     def good_enough(self) -> bool:
         """Whether the last few steps found a loss below ``enough_loss``: more would fit these views, not the scene."""

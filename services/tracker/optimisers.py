@@ -18,6 +18,7 @@ from vtslam.common.splat.engine import Engine, Rendering
 from vtslam.services.tracker.state import UNKNOWN_VARIANCE
 
 _ADAPTIVE_SILHOUETTES = (0.990, 0.993, 0.995, 0.997, 0.999)
+_SMALL_STEP = 20.0  # in steps that end a level
 _COARSEST_SIDE_PX = 15  # smaller images say nothing about a pose
 
 
@@ -204,7 +205,8 @@ class _GaussNewton:
                 depth_weight=self._weights.depth_weight,
             )
             first = first or loss
-            coarsest = levels - 1 if spent == 1 else 0
+            # From the guess the view differs too much for its pixels to matter: they wait for the second rendering.
+            coarsest, finest = (levels - 1, int(renders > 1)) if spent == 1 else (0, 0)
             reference = reference_view(
                 rendering,
                 self._camera,
@@ -220,6 +222,7 @@ class _GaussNewton:
                 T_observed_reference=np.eye(4),
                 prior=self._relative_prior(T),
                 coarsest=coarsest,
+                finest=finest,
                 threads=self._threads,
             )
             if not alignment.solved:
@@ -227,7 +230,7 @@ class _GaussNewton:
             T = se3.orthonormalized(alignment.T_observed_reference @ T)
             information = alignment.information
             step = se3.log(alignment.T_observed_reference)
-            if np.linalg.norm(step[:3]) < 5 * s.converged_m and np.linalg.norm(step[3:]) < 5 * s.converged_rad:
+            if finest == 0 and _is_small(step, s):
                 break
         assert first is not None
         assert loss is not None
@@ -241,6 +244,14 @@ class _GaussNewton:
         if self._prior is None:
             return None
         return self._prior.T_camera_map @ se3.inverse(T_camera_map), self._prior.information
+
+
+def _is_small(step: npt.NDArray[np.float64], settings: GaussNewtonSettings) -> bool:
+    """Whether a view from the pose before the step is as good as one from the pose after it."""
+    return bool(
+        np.linalg.norm(step[:3]) < _SMALL_STEP * settings.converged_m
+        and np.linalg.norm(step[3:]) < _SMALL_STEP * settings.converged_rad
+    )
 
 
 def _pyramid_levels(wanted: int, camera: Camera) -> int:

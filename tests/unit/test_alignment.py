@@ -81,6 +81,7 @@ def aligned(
     prior: tuple[Array, Array] | None = None,
     threads: int = 1,
     coarsest: int = 2,
+    finest: int = 0,
     settings: GaussNewtonSettings = SETTINGS,
 ) -> Alignment:
     return align(
@@ -90,6 +91,7 @@ def aligned(
         T_observed_reference=np.eye(4),
         prior=prior,
         coarsest=coarsest,
+        finest=finest,
         threads=threads,
     )
 
@@ -118,6 +120,14 @@ def test_each_term_is_enough_where_it_sees_the_motion(color_weight: float, depth
     metres, degrees = error_of(aligned(SmoothRoom(seed=7), true, settings=settings), true)
     assert metres < 0.002
     assert degrees < 0.05
+
+
+def test_alignment_ends_at_the_finest_level_asked_for() -> None:
+    room, true = SmoothRoom(seed=7), motion(11, metres=0.02, degrees=2.0)
+    found = {finest: aligned(room, true, finest=finest) for finest in (0, 1, 2, 5)}
+    assert found[2].T_observed_reference.tobytes() == found[5].T_observed_reference.tobytes()
+    assert len({alignment.T_observed_reference.tobytes() for alignment in found.values()}) == 3
+    assert error_of(found[0], true)[0] < error_of(found[2], true)[0] < 0.02
 
 
 def test_alignment_does_not_depend_on_threads() -> None:

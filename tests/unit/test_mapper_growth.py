@@ -220,6 +220,25 @@ def test_sealing_keeps_rows_and_gives_the_last_view_its_depth() -> None:
     np.testing.assert_array_equal(section.frames[5].view_depth, room_frame(5).depth)
 
 
+def test_sealing_drops_what_none_of_the_frames_shows() -> None:
+    settings = replace(SMALL_MAPPER, edge_supplement=True, initial_opacity=0.95, iterations_seal=6)
+    mapper, active, _ = opened(settings)
+    for index in (1, 2):
+        active, _ = mapper.map_regular(room_frame(index), room_pose(index), active, neighbours=[])
+    every, _ = mapper.seal(active, neighbours=[])
+    seen, renders = small_mapper(replace(settings, least_weight_sealed=0.05)).seal(active, neighbours=[])
+    assert renders == settings.iterations_seal
+    assert 0.5 * every.gaussians.count < seen.gaussians.count < 0.95 * every.gaussians.count
+    assert seen.means_m.shape == (seen.gaussians.count, 3)
+    kept = {row.tobytes() for row in every.means_m}
+    assert all(row.tobytes() in kept for row in seen.means_m)
+    for view in active.views:
+        T_camera_section = se3.inverse(every.frames[view.frame_index].T_section_frame)
+        full = mapper.engine.render(every.splats, view.frame.camera, T_camera_section)
+        thinned = mapper.engine.render(seen.splats, view.frame.camera, T_camera_section)
+        assert np.abs(full.rgb - thinned.rgb).mean() < 0.005
+
+
 def test_sealing_without_steps_changes_no_attribute() -> None:
     mapper, active, _ = opened(SMALL_MAPPER)
     section, renders = mapper.seal(active, neighbours=[])

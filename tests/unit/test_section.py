@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 from helpers.smooth_room import SmoothRoom, small_camera
 
 from vtslam.common.gaussians import tied_to_frame
@@ -74,6 +75,19 @@ def test_growing_gives_the_same_as_tying_anew() -> None:
     assert again.means_m.tobytes() == grown.means_m.tobytes()
     assert again.surface.tobytes() == grown.surface.tobytes()
     assert len(grown.surface) > len(section.surface) > 0
+
+
+@pytest.mark.parametrize("knew_its_depth", [False, True])
+def test_a_finished_section_is_as_it_will_be_read_back(knew_its_depth: bool) -> None:
+    section = small_section()
+    depth = SmoothRoom().frame(START @ STEP, CAMERA, frame_id=1).depth
+    last = replace(section.frames[1], view_depth=depth if knew_its_depth else None)
+    grown = replace(section, frames=(section.frames[0], last)).retied()
+    finished = grown.finished(1, depth)
+    anew = replace(finished, means_m=np.zeros((0, 3), np.float32)).retied()
+    assert finished.surface.tobytes() == anew.surface.tobytes()
+    assert len(finished.surface) > len(section.surface)
+    assert finished.means_m.tobytes() == anew.means_m.tobytes()
 
 
 def test_the_surface_is_what_the_views_with_depth_measured() -> None:
