@@ -66,10 +66,11 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument(
         "--in-process",
         action="store_true",
-        help="one process for all services; the result is the same",
+        help="one process for all services; the result is that of lockstep",
     )
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    _add_pacing(command, default="lockstep")
     _add_layers(command)
     _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
@@ -85,6 +86,7 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    _add_pacing(command, default="realtime")
     _add_layers(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
@@ -176,6 +178,19 @@ def _add_source_shorthands(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only (source.frames)")
     command.add_argument(
         "--holdout", type=int, metavar="K", help="track every K-th regular frame but keep it out of mapping (holdout)"
+    )
+
+
+def _add_pacing(command: argparse.ArgumentParser, *, default: str) -> None:
+    command.add_argument(
+        "--pacing",
+        dest="assignments",
+        action="append",
+        default=[],
+        type=lambda text: f'fleet.pacing="{text}"',
+        metavar="P",
+        help="lockstep: every frame, one after another; pipelined: the next is tracked while one is mapped; realtime: "
+        f"the newest, others are dropped (fleet.pacing; default: {default})",
     )
 
 

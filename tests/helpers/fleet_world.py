@@ -62,14 +62,14 @@ class FewFrames:
 
     uri, family = "few:", "tum"
 
-    def __init__(self, frames: int = FRAMES) -> None:
-        self._frames = frames
+    def __init__(self, frames: int = FRAMES, path: int = 48, size: tuple[int, int] = SIZE) -> None:
+        self._frames, self._path, self._size = frames, path, size
 
     def __len__(self) -> int:
         return self._frames
 
     def frame(self, index: int) -> Frame:
-        return room_frame(index, 48, SIZE)
+        return room_frame(index, self._path, self._size)
 
     @property
     def camera(self) -> Camera:
@@ -153,9 +153,11 @@ class _Conductor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stream:
-    """What goes through a fleet: so many frames, how they are mapped, and at which pace."""
+    """What goes through a fleet: frames of a closed path of ``path`` ones, how they are mapped, and at which pace."""
 
     frames: int = FRAMES
+    path: int = 48
+    size: tuple[int, int] = SIZE
     settings: Settings = SETTINGS
     pace: Pace = field(default_factory=Pace)
 
@@ -174,7 +176,8 @@ class FleetWorld:
         self, folder: Path, schedule: Schedule, kills: Kills | None = None, *, stream: Stream | None = None
     ) -> None:
         stream = stream or Stream()
-        self._pace, self._source, self._settings = stream.pace, FewFrames(stream.frames), stream.settings
+        self._pace, self._settings = stream.pace, stream.settings
+        self._source = FewFrames(stream.frames, stream.path, stream.size)
         self.world = MemoryWorld(schedule, kills=kills)
         self._folder = folder
         self._store = MapStore(folder / "map", budget_bytes=1 << 30, pins=24)
