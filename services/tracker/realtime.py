@@ -20,6 +20,7 @@ from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
+from vtslam.services.tracker.pose_ages import PoseAges
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
 from vtslam.services.tracker.state import TrackerState, TrackResult
 
@@ -57,7 +58,7 @@ class RealtimeTracker:
         self._ring: FrameRingReader | None = None
         self._descriptors = Descriptors(bus, link)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
-        self._poses = PosePublisher(bus, link)
+        self._poses, self._ages = PosePublisher(bus, link), PoseAges()
         self._state: TrackerState | None = None  # what is remembered; None at a start
         self._step_ns = 0  # between the last two frames tracked
         self._held: PinnedFrame | None = None  # the frame of the last pose
@@ -128,7 +129,15 @@ class RealtimeTracker:
             track_s=1e-9 * (self._clock.monotonic_ns() - start_ns),
         )
         self._done_with(held, descriptor)
+        if num_frames > 0:
+            self._note_age(frame.frame_id)
         return True
+
+    def _note_age(self, frame_id: int) -> None:
+        published_ns = self._descriptors.published_ns(frame_id)
+        if published_ns is not None:
+            self._ages.published(published_ns, self._clock.wall_ns())
+            self._link.gauges["pose_age_p99_ms"] = self._ages.quantile_ms(0.99)
 
     def _newest(self) -> tuple[PinnedFrame, FrameDescriptor] | None:
         """The newest frame, pinned; None if it was tracked, or waits for the first one to be in the map."""
