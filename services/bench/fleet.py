@@ -145,8 +145,7 @@ class _Watched:
             self.published.append((time.perf_counter(), self.counter("sensor", "frames.published")))
 
     def counter(self, service: str, name: str) -> int:
-        status = None if self._supervisor is None else self._supervisor.children[service].status
-        return 0 if status is None else status.counters.get(name, 0)
+        return 0 if self._supervisor is None else self._supervisor.children[service].counters.get(name, 0)
 
     def gauge(self, service: str, name: str) -> float:
         status = None if self._supervisor is None else self._supervisor.children[service].status

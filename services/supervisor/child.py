@@ -97,6 +97,7 @@ def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
         try:
             parts = _Parts(bus, link, folder, run, settings, info.facts.source)
             run_steps(_BUILDERS[name](parts), bus)
+            folder.write_counts(name, link.counters)
         except (SourceError, StorageError, MapStoreFull, SharedMemoryFull) as error:
             folder.write_failure(name, str(error))
             return REFUSED
