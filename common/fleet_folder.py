@@ -5,7 +5,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ SHARED_MEMORY = Path("/dev/shm")
 _HEX = re.compile("[0-9a-f]{1,16}")
 _PREFIX = "vtslam-"
 _NEW_PREFIX = ".vtslam-new-"  # then the maker's identity
-_OWNER, _RING, _MAP, _JOURNAL, _FAILED = "owner", "ring", "map", "journal", "failed"
+_OWNER, _RING, _MAP, _JOURNAL, _FAILED, _ENDED = "owner", "ring", "map", "journal", "failed", "ended"
 _MAX_OWNER_BYTES = 65536
 
 
@@ -103,6 +103,17 @@ class FleetFolder:
     def journal_path(self) -> Path:
         """Where the committed frames are written for the run folder."""
         return self.path / _JOURNAL
+
+    def write_counts(self, name: str, counters: Mapping[str, int]) -> None:
+        """Leave what a process has counted in all, when it has come to its end."""
+        (self.path / f"{_ENDED}-{checked_name(name)}").write_text(json.dumps(dict(counters)), encoding="utf-8")
+
+    def counts(self, name: str) -> dict[str, int] | None:
+        """What a process that has come to its end had counted; None if it left nothing."""
+        try:
+            return dict(json.loads((self.path / f"{_ENDED}-{checked_name(name)}").read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            return None
 
     def write_failure(self, name: str, text: str) -> None:
         """Leave word of why the process ``name`` cannot go on."""

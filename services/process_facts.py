@@ -36,7 +36,19 @@ def peak_rss_mb() -> float:
 
     From the kernel's VmHWM: getrusage would also count what the process was before it became this program.
     """
-    for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():
-        if line.startswith("VmHWM:"):
+    return _status_mb(_STATUS, "VmHWM:")
+
+
+def private_rss_mb(pid: int) -> float:
+    """Memory of a process that is no file's and nobody else's (RssAnon), in 10^6 bytes; 0 if there is no such one."""
+    try:
+        return _status_mb(Path(f"/proc/{pid}/status"), "RssAnon:")
+    except OSError:
+        return 0.0
+
+
+def _status_mb(path: Path, key: str) -> float:
+    for line in path.read_text(encoding="ascii", errors="replace").splitlines():
+        if line.startswith(key):
             return int(line.split()[1]) * 1024 / 1e6
     return 0.0

@@ -117,11 +117,12 @@ class TrackedPose(Message):
         state: Whether to trust it.
         overlap_section_id: For heads, the section it was tracked against; -1 otherwise.
         history: What the tracker remembers once the frame is committed.
+        num_tracked: Frames tracked so far, this one included; in realtime fewer than were published.
         read_s, track_s: Seconds that reading the frame from its source and tracking it took.
     """
 
     KIND: ClassVar[str] = "tracked_pose"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     frame_id: Count
     capture_time_ns: Count
@@ -136,6 +137,7 @@ class TrackedPose(Message):
     state: Annotated[PoseState, Choice(PoseState)]
     overlap_section_id: OptionalId
     history: Annotated[TrackerHistory, _HISTORY] = field(default_factory=TrackerHistory)
+    num_tracked: Count = 0
     read_s: NonNegative = 0.0
     track_s: NonNegative = 0.0
 

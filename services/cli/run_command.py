@@ -5,9 +5,11 @@ from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
+from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
+from vtslam.services.pacing import Pacing
 from vtslam.services.run_plan import RunPlan, plan_run
 from vtslam.services.run_record import RunSummary
 
@@ -18,6 +20,9 @@ def run_command(args: Namespace) -> int:
     plan = plan_run(
         args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
     )
+    pacing = plan.settings.fleet.pacing
+    if args.in_process and pacing not in ("", Pacing.LOCKSTEP):
+        raise ConfigError(f"--in-process works in lockstep, expected no other pacing, found {pacing}")
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
         watched = watched_run if args.in_process else watched_fleet

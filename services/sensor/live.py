@@ -4,11 +4,11 @@ from pathlib import Path
 
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
-from vtslam.common.messages import Credit, FrameDescriptor, FramePixels, ServiceState
+from vtslam.common.messages import Credit, FramePixels, ServiceState
 from vtslam.common.shm.frame_ring import FrameRingReader, FrameRingWriter
 from vtslam.common.shm.ring_layout import FrameDescriptor as RingDescriptor
 from vtslam.common.topics import MAPPER_COMMITTED, SENSOR_CREDIT, SENSOR_FRAME, SENSOR_PIXELS
-from vtslam.services.sensor.ring import CREDIT, make_ring
+from vtslam.services.sensor.ring import descriptor_message, make_ring
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 
 WINDOW = 4  # frames a publisher may have under way
@@ -21,14 +21,17 @@ class LiveSensor:
     there. A publisher keeps what is not committed, so a sensor that starts again gets it again. Frames of other
     numbers, of another camera or scale than the first one's, are refused and counted.
 
+    Without a credit (realtime) a frame in the ring is done with for its publisher, whatever becomes of it there.
+
     Args:
         bus: Its session.
         link: What it says of itself and is told.
         ring_path: Where the ring is, or will be once the first frame came.
+        credit: Frames that may be in the ring without being committed; None in realtime, where the oldest one goes.
     """
 
-    def __init__(self, bus: Bus, link: ServiceLink, ring_path: Path) -> None:
-        self._clock, self._link, self._ring_path = bus.clock, link, ring_path
+    def __init__(self, bus: Bus, link: ServiceLink, ring_path: Path, *, credit: int | None = 2) -> None:
+        self._clock, self._link, self._ring_path, self._credit_frames = bus.clock, link, ring_path, credit
         self._pixels = bus.subscriber(SENSOR_PIXELS)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
         self._frames = bus.publisher(SENSOR_FRAME)
@@ -72,14 +75,19 @@ class LiveSensor:
             return True
         frame = _frame_of(pixels)
         if self._ring is None:
-            self._ring = make_ring(self._ring_path, frame.camera)
-        descriptor = self._ring.try_publish(frame, credit=CREDIT)
+            self._ring = make_ring(self._ring_path, frame.camera, credit=self._credit_frames)
+        descriptor = self._published(self._ring, frame)
         if descriptor is None:
             return False
         self._pending, self._like = None, self._like or frame
         self._announce(frame, descriptor)
-        self._link.count("frames.published")
+        self._link.counters["frames.published"] = self._wanted
         return True
+
+    def _published(self, ring: FrameRingWriter, frame: Frame) -> RingDescriptor | None:
+        if self._credit_frames is None:
+            return ring.publish_newest(frame)
+        return ring.try_publish(frame, credit=self._credit_frames)
 
     def _is_wanted(self, pixels: FramePixels) -> bool:
         if pixels.frame_id != self._wanted:
@@ -93,7 +101,9 @@ class LiveSensor:
 
     def _grant(self) -> None:
         """Say how far publishers may go, when that has changed and now and then."""
-        committed = -1 if self._ring is None else self._ring.acknowledged - 1
+        committed = self._wanted - 1
+        if self._ring is not None and self._credit_frames is not None:
+            committed = self._ring.acknowledged - 1
         now_ns = self._clock.monotonic_ns()
         if self._told == (committed, self._wanted) and now_ns - self._told_ns < HEARTBEAT_S * 1e9:
             return
@@ -117,17 +127,7 @@ class LiveSensor:
                 self._announce(frame, descriptor)
 
     def _announce(self, frame: Frame, descriptor: RingDescriptor) -> None:
-        self._frames.publish(
-            FrameDescriptor(
-                frame_id=frame.frame_id,
-                capture_time_ns=frame.capture_time_ns,
-                slot=descriptor.slot,
-                slot_sequence=descriptor.sequence,
-                width=frame.camera.width,
-                height=frame.camera.height,
-                epoch=self._link.epoch,
-            )
-        )
+        self._frames.publish(descriptor_message(frame, descriptor, epoch=self._link.epoch))
 
 
 def _frame_of(pixels: FramePixels) -> Frame:

@@ -14,10 +14,12 @@ from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
+from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
+from vtslam.services.supervisor.processes import LIVE_SOURCE
 from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
@@ -46,7 +48,7 @@ class FleetHooks:
 def run_in_fleet(
     run: RunFolder, settings: Settings, hooks: FleetHooks, *, fleet: str = "", base: Path = SHARED_MEMORY
 ) -> RunSummary:
-    """Run the recording that ``run.toml`` names, each service a process of its own, in lockstep.
+    """Run the source that ``run.toml`` names, each service a process of its own.
 
     Args:
         run: An empty run folder, open for writing; settings and source are read from its ``run.toml``.
@@ -80,6 +82,7 @@ def run_in_fleet(
                 folder=folder,
                 recorder=recorder,
                 hang_s=settings.fleet.hang_s,
+                pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,
                 on_event=hooks.on_event,
                 environment=hooks.environment,
             )

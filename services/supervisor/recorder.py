@@ -52,7 +52,8 @@ class Recorder:
 
     def _take_frames(self) -> None:
         for frame in self._journal.new_frames():
-            is_new = frame.facts.frame_id >= self.num_frames
+            last = self._record.last()
+            is_new = last is None or frame.facts.frame_id > last.facts.frame_id
             self._record.add(frame)
             if is_new:
                 self._on_frame(frame.facts)

@@ -26,6 +26,7 @@ ASSIGNMENTS = (
     "mapper.keep_moments=true",
     "holdout=4",
     "splat.threads=1",
+    "fleet.pacing=lockstep",
 )
 
 

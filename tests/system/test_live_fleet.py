@@ -75,7 +75,9 @@ def test_what_is_published_is_mapped_as_the_recording_is(
 
 def test_up_and_publish_on_the_command_line(small: SmallRecording, tmp_path: Path) -> None:
     out, fleet = tmp_path / "run", f"test-up-{os.getpid()}"
-    process = start_vtslam("up", "--fleet", fleet, "--out", str(out), "--set", "section.length=3")
+    process = start_vtslam(
+        "up", "--fleet", fleet, "--out", str(out), "--pacing", "lockstep", "--set", "section.length=3"
+    )
     try:
         for _ in range(int(DEADLINE_S / POLL_S)):
             if fleet in running_fleets():
