@@ -19,7 +19,7 @@ from vtslam.common.shm.process_identity import is_alive, own_identity, pid_of
 
 PAGE_BYTES = mmap.PAGESIZE
 CONTROL_BYTES = PAGE_BYTES
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 MAX_PINS = 24
 
 _MAGIC = int.from_bytes(b"VTSLSHM1", "little")

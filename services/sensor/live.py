@@ -138,4 +138,5 @@ def _frame_of(pixels: FramePixels) -> Frame:
         depth=pixels.depth,
         depth_scale_m=pixels.depth_scale_m,
         camera=pixels.camera,
+        pose_prior=pixels.pose_prior,
     )

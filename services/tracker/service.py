@@ -1,5 +1,6 @@
 """The tracker as a service: the next frame of the ring against the map as committed, a pose on the bus."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,6 @@ from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.messages import (
     Odometry,
-    PoseQuality,
-    PoseState,
     ServiceState,
     TrackedPose,
     TrackerHistory,
@@ -20,11 +19,12 @@ from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.topics import MAPPER_COMMITTED, SENSOR_FRAME, TRACKER_ODOMETRY, TRACKER_POSE
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 from vtslam.services.map_follower import MapFollower
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.masks import mean_depth_m
-from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackingState, TrackResult
+from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackResult, first_pose
 
 
 class TrackerService:
@@ -98,7 +98,9 @@ class TrackerService:
         state = self._state()
         result = None
         if frame_id > 0:
-            result = self._tracker.track(frame, self._follower.map, state, section_id=section_id, is_head=row == 0)
+            result = self._tracker.track(
+                frame, self._follower.map, state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
+            )
         track_s = 1e-9 * (self._bus.clock.monotonic_ns() - start_ns)
         self._publish(frame, descriptor, state, result, section_id, track_s)
         self._proposed = frame_id
@@ -136,7 +138,7 @@ class TrackerService:
         section_id: int,
         track_s: float,
     ) -> None:
-        T_world_camera = np.eye(4) if result is None else result.T_world_camera
+        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
         covariance = np.zeros((6, 6)) if result is None else _sendable(result.covariance)
         after = state.after(frame, T_world_camera, result, mean_depth_m(frame))
         self._poses.publish(
@@ -151,7 +153,7 @@ class TrackerService:
                 T_world_camera=T_world_camera,
                 covariance=covariance,
                 quality=None if result is None else _quality(result),
-                state=PoseState.OK if result is None else PoseState(result.state.value),
+                state=TrackingState.OK if result is None else result.state,
                 overlap_section_id=-1 if result is None else result.overlap_section_id,
                 history=_history(after),
                 read_s=self._read_s.pop(frame.frame_id, 0.0),
@@ -185,7 +187,7 @@ class TrackerService:
             velocity_camera=velocity,
             pose_covariance=covariance,
             velocity_covariance=_sendable(velocity_covariance),
-            state=PoseState.OK if result is None else PoseState(result.state.value),
+            state=TrackingState.OK if result is None else result.state,
             epoch=self._link.epoch,
         )
 
@@ -198,14 +200,13 @@ def _history(state: TrackerState) -> TrackerHistory:
     )
 
 
-def _quality(result: TrackResult) -> PoseQuality:
+def _quality(result: TrackResult) -> TrackingQuality:
     quality = result.quality
-    return PoseQuality(
+    return replace(
+        quality,
         color_loss=_finite(quality.color_loss),
         depth_loss_m=_finite(quality.depth_loss_m),
         covered_share=_finite(quality.covered_share),
-        renders=quality.renders,
-        section_id=quality.section_id,
         rescued=bool(quality.rescued),
     )
 

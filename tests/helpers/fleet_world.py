@@ -2,19 +2,20 @@
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from helpers.small_map import room_frame, section_bytes
+from helpers.small_map import room_frame, room_pose, section_bytes
 
 from vtslam.common import failpoints
 from vtslam.common.bus import Bus, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld
 from vtslam.common.bus_schedule import Kills, Schedule
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.messages import Command, Control
@@ -49,7 +50,7 @@ ENGINE = NativeEngine(threads=1)
 
 
 class FewFrames:
-    """A source in memory."""
+    """A source in memory; some frames have a pose prior."""
 
     uri, family = "few:", "tum"
 
@@ -57,7 +58,9 @@ class FewFrames:
         return FRAMES
 
     def frame(self, index: int) -> Frame:
-        return room_frame(index, 48, SIZE)
+        frame = room_frame(index, 48, SIZE)
+        prior = ExternalPose(T_world_camera=room_pose(index, 48), covariance=1e-4 * np.eye(6))
+        return replace(frame, pose_prior=prior if index in (0, 1, 3) else None)
 
     @property
     def camera(self) -> Camera:
