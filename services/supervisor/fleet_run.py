@@ -17,7 +17,9 @@ from vtslam.services.frame_journal import JournalReader
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.errors import FleetError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
+from vtslam.services.supervisor.processes import PROCESSES
 from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
@@ -57,7 +59,8 @@ def run_in_fleet(
 
     Raises:
         SourceError: A frame cannot be read; what was done before it is kept.
-        FleetError: A process cannot be kept alive, or the port for metrics is taken; sections written so far are kept.
+        FleetError: A process cannot be kept alive, or the port for metrics is taken; the poses of all committed frames
+            and the sealed sections are kept.
         SharedMemoryError, BusError, PrivateFolderError: Shared memory or bus cannot be set up.
         StorageError: The run folder cannot be written.
     """
@@ -66,6 +69,8 @@ def run_in_fleet(
     fleet = fleet or f"run-{os.getpid()}-{secrets.token_hex(3)}"
     folder = FleetFolder.create(fleet, run_folder=str(run.path.resolve()), base=base)
     try:
+        for process in PROCESSES:
+            folder.reserve_failure(process.name)
         store, metrics = map_store(folder, settings), FleetMetrics()
 
         def on_frame(facts: FrameFacts) -> None:
@@ -84,19 +89,26 @@ def run_in_fleet(
                 environment=hooks.environment,
             )
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
-                interrupted = _supervised(supervisor, bus, hooks)
-        children = supervisor.children.values()
+                try:
+                    interrupted = _supervised(supervisor, bus, hooks)
+                except FleetError:
+                    recorder.finish_broken(seconds=time.perf_counter() - start_s, peak_rss_mb=_peak_rss_mb(supervisor))
+                    raise
         summary = recorder.finish(
             finished=not interrupted and supervisor.refusal is None,
             interrupted=interrupted,
             seconds=time.perf_counter() - start_s,
-            peak_rss_mb=peak_rss_mb() + sum(child.peak_rss_mb for child in children),
+            peak_rss_mb=_peak_rss_mb(supervisor),
         )
     finally:
         folder.remove()
     if supervisor.refusal is not None:
         raise SourceError(str(supervisor.refusal))
     return summary
+
+
+def _peak_rss_mb(supervisor: Supervisor) -> float:
+    return peak_rss_mb() + sum(child.peak_rss_mb for child in supervisor.children.values())
 
 
 def _supervised(supervisor: Supervisor, bus: Bus, hooks: FleetHooks) -> bool:

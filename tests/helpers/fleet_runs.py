@@ -47,8 +47,9 @@ def write_small_recording(folder: Path) -> ReplicaRecording:
     return filled(recording)
 
 
-def small_plan(recording: ReplicaRecording, *assignments: str) -> RunPlan:
-    return plan_run(recording.uri, family="tum", assignments=[*ASSIGNMENTS, *assignments])
+def small_plan(recording: ReplicaRecording, *assignments: str, source: str = "") -> RunPlan:
+    """The plan of a run; ``source`` is added to the recording's URI."""
+    return plan_run(recording.uri + source, family="tum", assignments=[*ASSIGNMENTS, *assignments])
 
 
 def result_bytes(run: Path) -> dict[str, bytes]:
