@@ -16,7 +16,7 @@ import zenoh
 from zenoh import ext, handlers
 
 from vtslam.common.bus import Bus, BusError, Clock, Closeable, Member, SystemClock
-from vtslam.common.bus_access import Login, NetworkAccess
+from vtslam.common.bus_access import Login, NetworkAccess, own_login
 from vtslam.common.bus_config import Config, hub_config, member_config
 from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.bus_life import AliveWatcher
@@ -78,7 +78,7 @@ def join(member: Member, folder: Path, *, login: Login | None = None, timeout_s:
     Args:
         member: Who opens it.
         folder: The fleet's run-time folder.
-        login: Needed where the hub has a password file.
+        login: Needed where the hub has a password file; what the fleet left in its folder unless given.
         timeout_s: How long to wait for the hub.
 
     Raises:
@@ -86,7 +86,7 @@ def join(member: Member, folder: Path, *, login: Login | None = None, timeout_s:
         BusError: No hub took the connection within the time.
     """
     check_private_folder(folder)
-    return join_by(member, member_config(folder, login), timeout_s=timeout_s)
+    return join_by(member, member_config(folder, login or own_login(folder)), timeout_s=timeout_s)
 
 
 def join_by(member: Member, config: Config, *, timeout_s: float = 10.0, clock: Clock | None = None) -> "ZenohBus":

@@ -14,6 +14,7 @@ from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
+from vtslam.services.network import Door
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
@@ -46,7 +47,13 @@ class FleetHooks:
 
 
 def run_in_fleet(
-    run: RunFolder, settings: Settings, hooks: FleetHooks, *, fleet: str = "", base: Path = SHARED_MEMORY
+    run: RunFolder,
+    settings: Settings,
+    hooks: FleetHooks,
+    *,
+    fleet: str = "",
+    base: Path = SHARED_MEMORY,
+    door: Door | None = None,
 ) -> RunSummary:
     """Run the recording that ``run.toml`` names, each service a process of its own, in lockstep.
 
@@ -56,6 +63,7 @@ def run_in_fleet(
         hooks: What the caller is told and asked.
         fleet: Name of the fleet; one of its own unless given.
         base: Where the fleet's shared memory lies.
+        door: How it is opened to other hosts; closed unless given.
 
     Raises:
         SourceError: A frame cannot be read; what was done before it is kept.
@@ -78,7 +86,8 @@ def run_in_fleet(
             hooks.on_frame(facts)
 
         recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
-        with Hub(folder.path, fleet) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
+        access = None if door is None else door.access_of(folder.path)
+        with Hub(folder.path, fleet, access) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
             supervisor = Supervisor(
                 bus,
                 fleet=fleet,

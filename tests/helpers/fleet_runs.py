@@ -6,13 +6,16 @@ import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Thread
 
 from helpers.recordings import ReplicaRecording, filled
 
+from vtslam.services.network import Door
 from vtslam.services.run_plan import RunPlan, plan_run
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.fleet_run import FleetHooks
+from vtslam.services.supervisor.live_run import run_live
 from vtslam.services.supervisor.supervisor import Supervisor
 
 FRAMES, SECTION = 20, 6
@@ -124,3 +127,30 @@ def fleet_run(
 ) -> RunSummary:
     """The small recording through a fleet."""
     return small_plan(recording).execute_in_fleet(out, (disturbance or Disturbance()).hooks(should_stop))
+
+
+def live_run(
+    out: Path, fleet: str, disturbance: Disturbance, publish: Callable[[], None], *, door: Door | None = None
+) -> RunSummary:
+    """A live fleet that ends once ``publish``, in a thread of its own, has returned."""
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            publish()
+        except BaseException as error:
+            failed.append(error)
+
+    publisher = Thread(target=work)
+
+    def is_done() -> bool:
+        if publisher.ident is None:
+            publisher.start()
+        return not publisher.is_alive()
+
+    try:
+        hooks = disturbance.hooks(is_done)
+        return run_live(out, hooks, fleet=fleet, preset="fast", family="tum", assignments=ASSIGNMENTS, door=door)
+    finally:
+        publisher.join()
+        assert not failed, failed

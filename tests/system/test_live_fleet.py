@@ -3,48 +3,19 @@
 import os
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
-from threading import Thread
 
 import pytest
 from helpers.cli_runs import DEADLINE_S, POLL_S, start_vtslam
-from helpers.fleet_runs import ASSIGNMENTS, FRAMES, Disturbance, SmallRecording, result_bytes
+from helpers.fleet_runs import FRAMES, Disturbance, SmallRecording, live_run, result_bytes
 
 from vtslam.common.fleet_folder import running_fleets
 from vtslam.services.cli.__main__ import main
-from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.publisher import FramePublisher
 from vtslam.services.sensor.sources.registry import open_source
-from vtslam.services.supervisor.live_run import run_live
 from vtslam.storage.run_folder import RunFolder
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "publish-your-sensor.md"
-
-
-def live_run(out: Path, fleet: str, disturbance: Disturbance, publish: Callable[[], None]) -> RunSummary:
-    """A live fleet that ends once ``publish``, in a thread of its own, has returned."""
-    failed: list[BaseException] = []
-
-    def work() -> None:
-        try:
-            publish()
-        except BaseException as error:
-            failed.append(error)
-
-    publisher = Thread(target=work)
-
-    def is_done() -> bool:
-        if publisher.ident is None:
-            publisher.start()
-        return not publisher.is_alive()
-
-    try:
-        hooks = disturbance.hooks(is_done)
-        return run_live(out, hooks, fleet=fleet, preset="fast", family="tum", assignments=ASSIGNMENTS)
-    finally:
-        publisher.join()
-        assert not failed, failed
 
 
 @pytest.mark.parametrize(
