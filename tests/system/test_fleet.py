@@ -9,11 +9,12 @@ from urllib.request import urlopen
 
 import pytest
 from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
-from helpers.processes import is_gone, leftovers
+from helpers.processes import leftovers
 from helpers.recordings import cut_in_half
 from helpers.shared_data import shared_data
 
 from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
