@@ -315,14 +315,16 @@ class _Publisher(Generic[M]):
                 publish_time_ns=self._bus.clock.wall_ns(),
                 max_bytes=self._topic.max_bytes,
             )
+            sequence = self._sequence
             if self._kept is not None:
-                self._kept.add(self._sequence, data)
+                self._kept.add(sequence, data)
+            # Also if sending fails: readers may ask for what is kept, and a number must not stand for two messages.
+            self._sequence += 1
             try:
                 self._declared.put(data)
             except zenoh.ZError as error:
                 raise BusError(f"{self._topic.suffix}: {error}") from error
-            self._sequence += 1
-            return self._sequence - 1
+            return sequence
 
     def close(self) -> None:
         with self._lock:
