@@ -11,7 +11,7 @@ from helpers.bus_messages import descriptor
 from vtslam.common.bus import BusError
 from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.bus_life import AliveWatcher
-from vtslam.common.bus_order import MAX_AGAIN, Arrivals
+from vtslam.common.bus_order import MAX_AGAIN, Arrivals, Gap
 from vtslam.common.bus_received import Received
 from vtslam.common.messages import FrameDescriptor, encode
 from vtslam.common.topics import SENSOR_FRAME, Role
@@ -166,7 +166,8 @@ def test_messages_that_never_reached_the_bus_arrive_all_the_same(monkeypatch: py
 
 
 def test_what_is_left_after_closing_is_read_without_asking_anybody() -> None:
-    now_ns, asked = [0], []
+    now_ns = [0]
+    asked: list[Gap] = []
     subscriber = Subscriber(
         SENSOR_FRAME,
         newest_only=False,
