@@ -109,6 +109,7 @@ class FleetFolder:
     def reserve_failure(self, name: str) -> None:
         """Make room for :meth:`write_failure`, whose reason may be that there is none; raises SharedMemoryFull."""
         path = self._failure_path(name)
+        path.unlink(missing_ok=True)
         fd = make_file(path, _FAILURE_BYTES)
         try:
             reserve(path, fd, 0, _FAILURE_BYTES)

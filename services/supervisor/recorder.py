@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable
 
-from vtslam.common.shm.errors import SectionNotResident, SectionPinned
+from vtslam.common.shm.errors import SectionNotResident, SectionPinned, SharedMemoryError
 from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame, FrameFacts
@@ -58,9 +58,10 @@ class Recorder:
     def finish_broken(self, *, seconds: float, peak_rss_mb: float) -> None:
         """Write what is known of a fleet that cannot go on; the frames of its open section are in no section file."""
         self.step()
-        last = self._store.last_commit()  # whoever committed it may have died before it wrote to the journal
-        if last is not None:
-            self._take(CommitFacts.unpacked(last.facts).frame)
+        with contextlib.suppress(SharedMemoryError):  # which may be why the fleet cannot go on
+            last = self._store.last_commit()  # whoever committed it may have died before it wrote to the journal
+            if last is not None:
+                self._take(CommitFacts.unpacked(last.facts).frame)
         self._record.finish(finished=False, interrupted=False, seconds=seconds, peak_rss_mb=peak_rss_mb)
 
     def _take_frames(self) -> None:
