@@ -5,7 +5,7 @@ import random
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +16,7 @@ from vtslam.common.fleet_folder import SHARED_MEMORY
 from vtslam.services.bench.supervisor_kill import seconds_after_supervisor_kill
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.run_plan import RunPlan
+from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.supervisor import Supervisor
 from vtslam.storage.run_folder import RunFolder
@@ -49,8 +50,8 @@ class _Disturber:
         on_frame: Called after each frame.
         rng: Draws how long after its frame a signal is sent, so that it meets any part of the work.
         sent: Signals sent, by (service, signal).
-        deaths, hangs: By service, as the supervisor counts them.
         pids: All processes seen.
+        children: The processes as their supervisor sees them.
         frames: Frames committed.
     """
 
@@ -59,9 +60,8 @@ class _Disturber:
     on_frame: Callable[[FrameFacts], None]
     rng: random.Random
     sent: Counter[tuple[str, signal.Signals]] = field(default_factory=Counter)
-    deaths: dict[str, int] = field(default_factory=dict)
-    hangs: dict[str, int] = field(default_factory=dict)
     pids: set[int] = field(default_factory=set)
+    children: Mapping[str, ChildProcess] = field(default_factory=dict)
     frames: int = 0
     _stopped: list[_Stopped] = field(default_factory=list)
     _due_s: float | None = None
@@ -78,8 +78,8 @@ class _Disturber:
         self.on_frame(facts)
 
     def _step(self, supervisor: Supervisor) -> None:
-        for name, child in supervisor.children.items():
-            self.deaths[name], self.hangs[name] = child.deaths, child.hangs
+        self.children = supervisor.children
+        for child in supervisor.children.values():
             if child.pid is not None:
                 self.pids.add(child.pid)
         self._wake_stopped(supervisor)
@@ -135,7 +135,7 @@ def bench_chaos(
         identical = _result_bytes(calm) == _result_bytes(disturbed)
         gone_s = seconds_after_supervisor_kill(plan, Path(folder))
     sent_kills = {name: disturber.sent[name, signal.SIGKILL] for name in _SERVICES}
-    killed = {name: disturber.deaths[name] - disturber.hangs[name] for name in _SERVICES}
+    killed = {name: child.deaths - child.hangs for name, child in disturber.children.items()}
     return {
         "kills": sum(killed.values()),
         "kills_by_service": killed,

@@ -3,7 +3,7 @@
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -14,6 +14,7 @@ from vtslam.services.network import Door
 from vtslam.services.run_plan import RunPlan, plan_run
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.live_run import run_live
 from vtslam.services.supervisor.supervisor import Supervisor
@@ -77,18 +78,26 @@ class Disturbance:
         signals: (frames, process, signal), each sent once.
         failpoints: By (process, start), as in ``shm.commit.before_flip:3``.
         events: What the supervisor told.
-        deaths: By process, afterwards.
-        hangs: By process, afterwards.
         pids: All that were seen.
+        children: The processes as their supervisor sees them.
     """
 
     signals: list[tuple[int, str, signal.Signals]] = field(default_factory=list)
     failpoints: dict[tuple[str, int], str] = field(default_factory=dict)
     events: list[str] = field(default_factory=list)
-    deaths: dict[str, int] = field(default_factory=dict)
-    hangs: dict[str, int] = field(default_factory=dict)
     pids: set[int] = field(default_factory=set)
+    children: Mapping[str, ChildProcess] = field(default_factory=dict)
     frames: int = 0
+
+    @property
+    def deaths(self) -> dict[str, int]:
+        """By process, up to now."""
+        return {name: child.deaths for name, child in self.children.items()}
+
+    @property
+    def hangs(self) -> dict[str, int]:
+        """By process, up to now."""
+        return {name: child.hangs for name, child in self.children.items()}
 
     def hooks(self, should_stop: Callable[[], bool] = lambda: False) -> FleetHooks:
         return FleetHooks(
@@ -107,8 +116,8 @@ class Disturbance:
         return {"VTSLAM_FAILPOINT": self.failpoints.get((name, epoch), "")}
 
     def _step(self, supervisor: Supervisor) -> None:
-        for name, child in supervisor.children.items():
-            self.deaths[name], self.hangs[name] = child.deaths, child.hangs
+        self.children = supervisor.children
+        for child in supervisor.children.values():
             if child.pid is not None:
                 self.pids.add(child.pid)
         for wanted in [each for each in self.signals if each[0] <= self.frames]:
