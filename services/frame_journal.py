@@ -8,6 +8,7 @@ import json
 import os
 from pathlib import Path
 
+from vtslam.common.shm.blocks import refusal_of
 from vtslam.services.frame_facts import CommittedFrame
 
 
@@ -19,6 +20,7 @@ class JournalWriter:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         data = path.read_bytes()
         whole = data.rfind(b"\n") + 1
@@ -26,10 +28,16 @@ class JournalWriter:
         os.lseek(self._fd, whole, os.SEEK_SET)
 
     def append(self, frame: CommittedFrame) -> None:
-        """Write a frame's line."""
+        """Write a frame's line; raises SharedMemoryFull with nothing written."""
         data = json.dumps(frame.as_plain()).encode() + b"\n"
-        while data:
-            data = data[os.write(self._fd, data) :]
+        start, written = os.lseek(self._fd, 0, os.SEEK_CUR), 0
+        try:
+            while written < len(data):
+                written += os.write(self._fd, data[written:])
+        except OSError as error:
+            os.ftruncate(self._fd, start)
+            os.lseek(self._fd, start, os.SEEK_SET)
+            raise refusal_of(self._path, error, len(data)) from error
 
     def close(self) -> None:
         """Give the descriptor back."""

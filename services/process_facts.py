@@ -1,4 +1,4 @@
-"""What a process can say of itself: memory, and the versions its results may depend on."""
+"""What a process can say of itself (memory, the versions its results may depend on), and of other processes."""
 
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -52,3 +52,25 @@ def _status_mb(path: Path, key: str) -> float:
         if line.startswith(key):
             return int(line.split()[1]) * 1024 / 1e6
     return 0.0
+
+
+def is_gone(pid: int) -> bool:
+    """Whether there is no such process, or only what its parent has not taken note of."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+def children_of(pid: int) -> set[int]:
+    """Pids of a process's children."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = path.read_text().rpartition(")")[2].split()[1]  # the name before it may hold anything
+        except OSError:
+            continue
+        if int(parent) == pid:
+            found.add(int(path.parent.name))
+    return found

@@ -87,6 +87,8 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_pacing(command, default="realtime")
+    command.add_argument("--listen", metavar="HOST:PORT", help="let other hosts in here; needs --access")
+    command.add_argument("--access", type=Path, metavar="FILE", help="who may come in (TOML, see deploy/runbook.md)")
     _add_layers(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
@@ -100,6 +102,8 @@ def _add_publish(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--connect", metavar="HOST:PORT", help="a fleet on another host; needs --credentials")
+    command.add_argument("--credentials", type=Path, metavar="FILE", help="login or certificate (TOML)")
     command.add_argument("--size", metavar="WxH", help="scale frames to this size")
     command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
 

@@ -93,6 +93,7 @@ class MapperService:
         self._facts: CommitFacts | None = None
         self._writer: ActiveWriter | None = None
         self._mapped: _Mapped | None = None
+        self._untold: CommitFacts | None = None  # committed, but there was no room in the journal
         self._ended: tuple[Section, int, CommitFacts] | None = None  # section, renders and facts; not sealed yet
         self._no_room_since_ns: int | None = None
         self._take_over()
@@ -104,6 +105,8 @@ class MapperService:
         if self._link.stopping:
             self._end()
             return None
+        if self._untold is not None:
+            return self._announce(self._untold)
         if self._mapped is not None:
             return self._commit(self._mapped)
         if self._active is not None and self._section_ends(self._active):
@@ -223,9 +226,7 @@ class MapperService:
         self._active, self._facts = mapped.active, mapped.facts
         self._map.committed(mapped.active.section)
         self._link.count("frames.committed")
-        if not self._section_ends(mapped.active):
-            self._announce(mapped.facts)
-        return 0.0
+        return 0.0 if self._section_ends(mapped.active) else self._announce(mapped.facts)
 
     def _spec(self, section: Section) -> ActiveSpec:
         length, mapper = self._settings.section.length, self._settings.mapper
@@ -278,8 +279,7 @@ class MapperService:
                 epoch=self._link.epoch,
             )
         )
-        self._announce(facts)
-        return 0.0
+        return self._announce(facts)
 
     def _end_of(self, active: ActiveSection) -> tuple[Section, int, CommitFacts]:
         assert self._facts is not None
@@ -290,9 +290,14 @@ class MapperService:
 
     # --- telling others ---------------------------------------------------------------------------------------------
 
-    def _announce(self, facts: CommitFacts) -> None:
+    def _announce(self, facts: CommitFacts) -> float:
         """Tell of the last commit; harmless if that was done before."""
-        self._journal.append(facts.frame)
+        self._untold = facts
+        try:
+            self._journal.append(facts.frame)
+        except SharedMemoryFull as error:
+            return self._wait_for_room(error)
+        self._untold = self._no_room_since_ns = None
         self._open_ring().acknowledge(facts.sequence)
         frame, about = facts.frame, facts.frame.facts
         self._committed.publish(
@@ -314,6 +319,7 @@ class MapperService:
                 epoch=self._link.epoch,
             )
         )
+        return 0.0
 
     def _open_ring(self) -> FrameRingReader:
         self._ring = self._ring or FrameRingReader(self._paths.ring)

@@ -62,6 +62,7 @@ class FramePublisher:
             camera=frame.camera,
             rgb=frame.rgb.copy(),  # the caller's may change before it is sent again
             depth=frame.depth.copy(),
+            pose_prior=None if frame.pose_prior is None else frame.pose_prior.copied(),
         )
         self._kept[number] = pixels
         self._next += 1

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.common.messages import FrameDescriptor
+from vtslam.common.messages import FrameCondition, FrameDescriptor
 from vtslam.common.shm.frame_ring import FrameRingWriter
 from vtslam.common.shm.ring_layout import FrameDescriptor as RingDescriptor
 from vtslam.common.shm.ring_layout import RingSpec
@@ -26,7 +26,14 @@ def make_ring(path: Path, camera: Camera, *, credit: int | None = None) -> Frame
     return FrameRingWriter.create(path, spec)
 
 
-def descriptor_message(frame: Frame, descriptor: RingDescriptor, *, epoch: int, read_s: float = 0.0) -> FrameDescriptor:
+def descriptor_message(
+    frame: Frame,
+    descriptor: RingDescriptor,
+    *,
+    epoch: int,
+    read_s: float = 0.0,
+    condition: FrameCondition = FrameCondition.OK,
+) -> FrameDescriptor:
     """What the sensor tells of a frame in the ring; ``read_s`` seconds were spent on reading it."""
     return FrameDescriptor(
         frame_id=frame.frame_id,
@@ -37,4 +44,5 @@ def descriptor_message(frame: Frame, descriptor: RingDescriptor, *, epoch: int, 
         height=frame.camera.height,
         epoch=epoch,
         read_s=read_s,
+        condition=condition,
     )

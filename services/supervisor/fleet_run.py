@@ -14,12 +14,14 @@ from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
+from vtslam.services.network import Door
 from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.errors import FleetError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
-from vtslam.services.supervisor.processes import LIVE_SOURCE
+from vtslam.services.supervisor.processes import LIVE_SOURCE, PROCESSES
 from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
@@ -46,7 +48,13 @@ class FleetHooks:
 
 
 def run_in_fleet(
-    run: RunFolder, settings: Settings, hooks: FleetHooks, *, fleet: str = "", base: Path = SHARED_MEMORY
+    run: RunFolder,
+    settings: Settings,
+    hooks: FleetHooks,
+    *,
+    fleet: str = "",
+    base: Path = SHARED_MEMORY,
+    door: Door | None = None,
 ) -> RunSummary:
     """Run the source that ``run.toml`` names, each service a process of its own.
 
@@ -56,10 +64,12 @@ def run_in_fleet(
         hooks: What the caller is told and asked.
         fleet: Name of the fleet; one of its own unless given.
         base: Where the fleet's shared memory lies.
+        door: How it is opened to other hosts; closed unless given.
 
     Raises:
         SourceError: A frame cannot be read; what was done before it is kept.
-        FleetError: A process cannot be kept alive, or the port for metrics is taken; sections written so far are kept.
+        FleetError: A process cannot be kept alive, or the port for metrics is taken; the poses of all committed frames
+            and the sealed sections are kept.
         SharedMemoryError, BusError, PrivateFolderError: Shared memory or bus cannot be set up.
         StorageError: The run folder cannot be written.
     """
@@ -68,6 +78,8 @@ def run_in_fleet(
     fleet = fleet or f"run-{os.getpid()}-{secrets.token_hex(3)}"
     folder = FleetFolder.create(fleet, run_folder=str(run.path.resolve()), base=base)
     try:
+        for process in PROCESSES:
+            folder.reserve_failure(process.name)
         store, metrics = map_store(folder, settings), FleetMetrics()
 
         def on_frame(facts: FrameFacts) -> None:
@@ -75,7 +87,8 @@ def run_in_fleet(
             hooks.on_frame(facts)
 
         recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
-        with Hub(folder.path, fleet) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
+        access = None if door is None else door.access_of(folder.path)
+        with Hub(folder.path, fleet, access) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
             supervisor = Supervisor(
                 bus,
                 fleet=fleet,
@@ -87,19 +100,26 @@ def run_in_fleet(
                 environment=hooks.environment,
             )
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
-                interrupted = _supervised(supervisor, bus, hooks)
-        children = supervisor.children.values()
+                try:
+                    interrupted = _supervised(supervisor, bus, hooks)
+                except FleetError:
+                    recorder.finish_broken(seconds=time.perf_counter() - start_s, peak_rss_mb=_peak_rss_mb(supervisor))
+                    raise
         summary = recorder.finish(
             finished=not interrupted and supervisor.refusal is None,
             interrupted=interrupted,
             seconds=time.perf_counter() - start_s,
-            peak_rss_mb=peak_rss_mb() + sum(child.peak_rss_mb for child in children),
+            peak_rss_mb=_peak_rss_mb(supervisor),
         )
     finally:
         folder.remove()
     if supervisor.refusal is not None:
         raise SourceError(str(supervisor.refusal))
     return summary
+
+
+def _peak_rss_mb(supervisor: Supervisor) -> float:
+    return peak_rss_mb() + sum(child.peak_rss_mb for child in supervisor.children.values())
 
 
 def _supervised(supervisor: Supervisor, bus: Bus, hooks: FleetHooks) -> bool:

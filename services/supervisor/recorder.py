@@ -3,9 +3,10 @@
 import contextlib
 from collections.abc import Callable
 
-from vtslam.common.shm.errors import SectionNotResident, SectionPinned
+from vtslam.common.shm.errors import SectionNotResident, SectionPinned, SharedMemoryError
 from vtslam.common.shm.map_store import MapStore
-from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.commit_facts import CommitFacts
+from vtslam.services.frame_facts import CommittedFrame, FrameFacts
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.storage.run_folder import RunFolder
@@ -37,10 +38,14 @@ class Recorder:
         """Frames committed, as far as they were seen here."""
         return self._record.num_frames
 
-    def step(self) -> None:
-        """Take in what is new, and let sections that are on disk leave memory; raises StorageError."""
+    def step(self, *, make_room: bool = False) -> None:
+        """Take in what is new, and let sections that are on disk leave memory, all but one if ``make_room``.
+
+        Raises:
+            StorageError: The run folder cannot be written.
+        """
         self._take_frames()
-        self._archive()
+        self._archive(resident=1 if make_room else _RESIDENT_SECTIONS)
         if self._frames_written < self._frames_on_disk <= self.num_frames:
             self._record.write()
             self._frames_written = self.num_frames
@@ -50,20 +55,32 @@ class Recorder:
         self.step()
         return self._record.finish(finished=finished, interrupted=interrupted, seconds=seconds, peak_rss_mb=peak_rss_mb)
 
+    def finish_broken(self, *, seconds: float, peak_rss_mb: float) -> None:
+        """Write what is known of a fleet that cannot go on; the frames of its open section are in no section file."""
+        self.step()
+        with contextlib.suppress(SharedMemoryError):  # which may be why the fleet cannot go on
+            last = self._store.last_commit()  # whoever committed it may have died before it wrote to the journal
+            if last is not None:
+                self._take(CommitFacts.unpacked(last.facts).frame)
+        self._record.finish(finished=False, interrupted=False, seconds=seconds, peak_rss_mb=peak_rss_mb)
+
     def _take_frames(self) -> None:
         for frame in self._journal.new_frames():
-            last = self._record.last()
-            is_new = last is None or frame.facts.frame_id > last.facts.frame_id
-            self._record.add(frame)
-            if is_new:
-                self._on_frame(frame.facts)
+            self._take(frame)
 
-    def _archive(self) -> None:
+    def _take(self, frame: CommittedFrame) -> None:
+        last = self._record.last()
+        is_new = last is None or frame.facts.frame_id > last.facts.frame_id
+        self._record.add(frame)
+        if is_new:
+            self._on_frame(frame.facts)
+
+    def _archive(self, *, resident: int) -> None:
         sealed = self._store.sealed_ids()
         for section_id in sealed:
             if section_id not in self._on_disk:
                 self._write(section_id)
-        for section_id in sealed[:-_RESIDENT_SECTIONS]:
+        for section_id in sealed[: max(len(sealed) - resident, 0)]:
             with contextlib.suppress(SectionPinned):
                 self._store.unlink_sealed(section_id, verified_on_disk=True)
 

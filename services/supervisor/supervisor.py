@@ -5,7 +5,7 @@ from enum import Enum
 
 from vtslam.common.bus import Bus
 from vtslam.common.fleet_folder import FleetFolder
-from vtslam.common.messages import Command, Control, ServiceState
+from vtslam.common.messages import Command, Control, ServiceState, ServiceStatus
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.topics import CONTROL, EVERY_SERVICE, MAPPER_COMMITTED, STATUS
@@ -70,6 +70,7 @@ class Supervisor:
         self._commits = bus.subscriber(MAPPER_COMMITTED, newest_only=True)
         self._orders = {name: bus.publisher(CONTROL, service=name) for name in self._children}
         self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
+        self._told: set[str] = set()  # processes that were said to wait
         self._phase = _Phase.RUNNING
         self.refusal: ProcessRefused | None = None
 
@@ -92,7 +93,7 @@ class Supervisor:
         self._listen()
         self._watch()
         self._advance()
-        self._recorder.step()
+        self._recorder.step(make_room=self._waits_for_memory())
         if self._phase is _Phase.ENDED:
             self._tell(ServiceState.FINISHED)
             return None
@@ -115,7 +116,18 @@ class Supervisor:
             child = self._children.get(received.message.service)
             if child is not None:
                 child.heard(received.message, 1e-9 * received.arrival_time_ns)
+                self._tell_of(received.message)
         self._commits.receive()  # wakes; what was committed is in the journal
+
+    def _tell_of(self, status: ServiceStatus) -> None:
+        """Tell the user once if a process works, but not as it should."""
+        if status.state is ServiceState.DEGRADED and status.service not in self._told:
+            self._told.add(status.service)
+            self._on_event(f"{status.service}: waits: {status.detail}")
+
+    def _waits_for_memory(self) -> bool:
+        status = self._children[MAPPER.name].status
+        return status is not None and status.state is ServiceState.DEGRADED
 
     def _watch(self) -> None:
         now_s, names = self._now_s(), self._alive.names()

@@ -1,17 +1,20 @@
 """What the tracker says of a frame: the pose it proposes to the mapper, and what robots read."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
-from vtslam.common.messages import Odometry, PoseQuality, PoseState, TrackedPose, TrackerHistory
+from vtslam.common.messages import Odometry, TrackedPose, TrackerHistory
 from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.topics import TRACKER_ODOMETRY, TRACKER_POSE
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.service_link import ServiceLink
-from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackingState, TrackResult
+from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackResult, first_pose
 
 
 class PosePublisher:
@@ -46,7 +49,7 @@ class PosePublisher:
         Args:
             frame: The frame.
             descriptor: Where it lies in the ring.
-            result: What tracking found; None for the first frame, whose pose is the identity.
+            result: What tracking found; None for the first frame, whose pose says where the world is.
             before: What the tracker remembers without the frame.
             after: What it remembers with it.
             section_id: The section it shall belong to.
@@ -55,7 +58,7 @@ class PosePublisher:
             read_s: Seconds that reading it took.
             track_s: Seconds that tracking it took.
         """
-        T_world_camera = np.eye(4) if result is None else result.T_world_camera
+        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
         covariance = np.zeros((6, 6)) if result is None else _sendable(result.covariance)
         self._poses.publish(
             TrackedPose(
@@ -69,7 +72,7 @@ class PosePublisher:
                 T_world_camera=T_world_camera,
                 covariance=covariance,
                 quality=None if result is None else _quality(result),
-                state=PoseState.OK if result is None else PoseState(result.state.value),
+                state=TrackingState.OK if result is None else result.state,
                 overlap_section_id=-1 if result is None else result.overlap_section_id,
                 history=_history(after),
                 num_tracked=num_tracked,
@@ -103,7 +106,7 @@ class PosePublisher:
             velocity_camera=velocity,
             pose_covariance=covariance,
             velocity_covariance=_sendable(velocity_covariance),
-            state=PoseState.OK if result is None else PoseState(result.state.value),
+            state=TrackingState.OK if result is None else result.state,
             epoch=self._link.epoch,
         )
 
@@ -130,14 +133,13 @@ def _history(state: TrackerState) -> TrackerHistory:
     )
 
 
-def _quality(result: TrackResult) -> PoseQuality:
+def _quality(result: TrackResult) -> TrackingQuality:
     quality = result.quality
-    return PoseQuality(
+    return replace(
+        quality,
         color_loss=_finite(quality.color_loss),
         depth_loss_m=_finite(quality.depth_loss_m),
         covered_share=_finite(quality.covered_share),
-        renders=quality.renders,
-        section_id=quality.section_id,
         rescued=bool(quality.rescued),
     )
 

@@ -113,6 +113,7 @@ class RealtimeTracker:
                 section_id=section_id,
                 is_head=active_id is None,
                 guess=self._guess(state, frame),
+                prior=frame.pose_prior,
             )
         after = self._remember(state, frame, result)
         self._tracked += 1
@@ -176,7 +177,7 @@ class RealtimeTracker:
     def _remember(self, state: TrackerState, frame: Frame, result: TrackResult | None) -> TrackerState:
         before = state.previous_frame
         self._step_ns = 0 if before is None else frame.capture_time_ns - before.capture_time_ns
-        T_world_camera = np.eye(4) if result is None else result.T_world_camera
+        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
         self._state = state.after(frame, T_world_camera, result, mean_depth_m(frame))
         return self._state
 

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.messages import ServiceState
@@ -18,7 +16,7 @@ from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
-from vtslam.services.tracker.state import TrackerState, TrackResult
+from vtslam.services.tracker.state import TrackerState, TrackResult, first_pose
 
 
 class TrackerService:
@@ -90,7 +88,9 @@ class TrackerService:
         frame = self._ring.copied(descriptor)
         state, result = self._state(frame_id, section_id), None
         if frame_id > 0:
-            result = self._tracker.track(frame, self._follower.map, state, section_id=section_id, is_head=row == 0)
+            result = self._tracker.track(
+                frame, self._follower.map, state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
+            )
         self._ahead = self._after(frame, state, result, section_id)
         self._poses.publish(
             frame,
@@ -142,7 +142,7 @@ class TrackerService:
 
     def _after(self, frame: Frame, state: TrackerState, result: TrackResult | None, section_id: int) -> TrackerState:
         """What is remembered with the frame; its pose goes through the section's frame, as the mapper's does."""
-        T_world_camera = np.eye(4) if result is None else result.T_world_camera
+        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
         after = state.after(frame, T_world_camera, result, mean_depth_m(frame))
         active = self._follower.map.active
         if active is None or active.section_id != section_id:

@@ -2,19 +2,20 @@
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from helpers.small_map import room_frame, section_bytes
+from helpers.small_map import room_frame, room_pose, section_bytes
 
 from vtslam.common import failpoints
 from vtslam.common.bus import Bus, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld
 from vtslam.common.bus_schedule import Kills, Schedule
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.messages import Command, Control
@@ -58,7 +59,7 @@ ENGINE = NativeEngine(threads=1)
 
 
 class FewFrames:
-    """A source in memory."""
+    """A source in memory; some frames have a pose prior."""
 
     uri, family = "few:", "tum"
 
@@ -69,7 +70,9 @@ class FewFrames:
         return self._frames
 
     def frame(self, index: int) -> Frame:
-        return room_frame(index, self._path, self._size)
+        frame = room_frame(index, self._path, self._size)
+        prior = ExternalPose(T_world_camera=room_pose(index, self._path), covariance=1e-4 * np.eye(6))
+        return replace(frame, pose_prior=prior if index in (0, 1, 3) else None)
 
     @property
     def camera(self) -> Camera:
