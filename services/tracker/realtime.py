@@ -22,7 +22,7 @@ from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_ages import PoseAges
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
-from vtslam.services.tracker.state import TrackerState, TrackResult
+from vtslam.services.tracker.state import TrackerState, TrackResult, first_pose
 
 _MAX_STEPS_AHEAD = 3.0  # as far as a velocity is trusted, in times of what it was measured over
 
