@@ -47,11 +47,10 @@ class CommitFacts:
             gain=np.array(facts.exposure_gain, np.float32), offset=np.array(facts.exposure_offset, np.float32)
         )
 
-    def with_seal(self, *, renders: int, seconds: float) -> "CommitFacts":
+    def with_seal(self, *, gaussians: int, renders: int, seconds: float) -> "CommitFacts":
         """The facts with the end of the section that the frame was the last of."""
-        return replace(
-            self, frame=replace(self.frame, facts=self.frame.facts.with_seal(renders=renders, seconds=seconds))
-        )
+        facts = self.frame.facts.with_seal(gaussians=gaussians, renders=renders, seconds=seconds)
+        return replace(self, frame=replace(self.frame, facts=facts))
 
     def packed(self) -> bytes:
         """As the map store keeps it; every number comes back exactly."""

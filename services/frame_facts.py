@@ -58,10 +58,11 @@ class FrameFacts:
     map_s: float
     total_s: float
 
-    def with_seal(self, *, renders: int, seconds: float) -> "FrameFacts":
+    def with_seal(self, *, gaussians: int, renders: int, seconds: float) -> "FrameFacts":
         """These facts with the end of the section that the frame was the last of."""
         return replace(
             self,
+            gaussians=gaussians,
             map_renders=self.map_renders + renders,
             map_s=self.map_s + seconds,
             total_s=self.total_s + seconds,
@@ -159,7 +160,6 @@ def frame_facts(
     covariance: npt.NDArray[np.float64],
     *,
     state: str,
-    seal_renders: int,
     seconds: Seconds,
 ) -> FrameFacts:
     """The facts of a frame.
@@ -169,7 +169,6 @@ def frame_facts(
         quality: What its pose rests on; None if it was not tracked.
         covariance: float64 [6,6] of the pose; zeros if it was not tracked.
         state: See `FrameFacts`.
-        seal_renders: Renders of ending the section with it.
         seconds: Where the time went.
     """
     variances = np.maximum(np.diag(covariance), 0.0)
@@ -192,7 +191,7 @@ def frame_facts(
         gaussians_added=commit.gaussians_added,
         gaussians=commit.gaussians,
         track_renders=0 if quality is None else quality.renders,
-        map_renders=commit.renders + seal_renders,
+        map_renders=commit.renders,
         read_s=seconds.read_s,
         track_s=seconds.track_s,
         map_s=seconds.map_s,

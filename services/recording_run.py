@@ -21,7 +21,7 @@ from vtslam.services.frame_facts import (
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.services.sensor.sources.base import Source, SourceError
-from vtslam.services.system import FrameReport, System
+from vtslam.services.system import FrameReport, Seal, System
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
 
@@ -87,18 +87,16 @@ class _Recorder:
         self._record.add(
             CommittedFrame(facts=facts, capture_time_ns=frame.capture_time_ns, T_world_camera=T_world_camera)
         )
-        if report.sealed_section_id is not None:
+        if report.sealed is not None:
             self._record.write()
         return facts
 
     def close(self, *, finished: bool, interrupted: bool) -> RunSummary:
         """Write the open section and everything else that is not written yet."""
         start_s = time.perf_counter()
-        renders = self._system.finish()
-        last = self._record.last()
-        if last is not None:
-            seconds = time.perf_counter() - start_s
-            self._record.add(replace(last, facts=last.facts.with_seal(renders=renders, seconds=seconds)))
+        sealed, last = self._system.finish(), self._record.last()
+        if sealed is not None and last is not None:
+            self._record.add(replace(last, facts=_with_seal(last.facts, sealed, time.perf_counter() - start_s)))
         return self._record.finish(
             finished=finished,
             interrupted=interrupted,
@@ -115,11 +113,15 @@ def _state(report: FrameReport) -> str:
 
 def _facts_of(report: FrameReport, *, read_s: float, total_s: float) -> FrameFacts:
     tracking = report.tracking
-    return frame_facts(
+    facts = frame_facts(
         report.commit,
         None if tracking is None else tracking.quality,
         np.zeros((6, 6)) if tracking is None else tracking.covariance,
         state=_state(report),
-        seal_renders=report.seal_renders,
         seconds=Seconds(read_s=read_s, track_s=report.track_s, map_s=report.map_s, total_s=total_s),
     )
+    return facts if report.sealed is None else _with_seal(facts, report.sealed, 0.0)
+
+
+def _with_seal(facts: FrameFacts, sealed: Seal, seconds: float) -> FrameFacts:
+    return facts.with_seal(gaussians=sealed.gaussians, renders=sealed.renders, seconds=seconds)

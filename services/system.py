@@ -27,22 +27,29 @@ class Archive(ReadsSections, Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seal:
+    """The end of a section: the Gaussians it ends with, and the renders spent on ending it."""
+
+    section_id: int
+    gaussians: int
+    renders: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameReport:
     """What happened to one frame: tracking (None for the first frame), mapping, and the section it sealed.
 
     Attributes:
         frame, tracking, commit: See above.
-        sealed_section_id: The section that the frame ended, or None.
-        seal_renders: Renders spent on ending it.
+        sealed: The end of the section that the frame was the last of, or None.
         track_s, map_s: Seconds of tracking, and of mapping with ending the section; 0 without a clock.
     """
 
     frame: Frame
     tracking: TrackResult | None
     commit: CommitRecord
-    sealed_section_id: int | None
-    seal_renders: int
+    sealed: Seal | None
     track_s: float
     map_s: float
 
@@ -113,25 +120,24 @@ class System:
             frame, commit.T_world_camera, tracking, mean_depth_m(frame), exposure=commit.exposure
         )
         self._frames += 1
-        sealed, renders = (section_id, self._seal()) if row == self.settings.section.length - 1 else (None, 0)
+        sealed = self._seal() if row == self.settings.section.length - 1 else None
         return FrameReport(
             frame=frame,
             tracking=tracking,
             commit=commit,
-            sealed_section_id=sealed,
-            seal_renders=renders,
+            sealed=sealed,
             track_s=tracked_s - start_s,
             map_s=self._clock() - tracked_s,
         )
 
-    def finish(self) -> int:
-        """Seal the section that is still open, if any; returns the renders spent."""
-        return 0 if self.active is None else self._seal()
+    def finish(self) -> Seal | None:
+        """Seal the section that is still open, if any."""
+        return None if self.active is None else self._seal()
 
-    def _seal(self) -> int:
+    def _seal(self) -> Seal:
         assert self.active is not None
         section, renders = self._mapper.seal(self.active)
         self._archive.write(section)
         self.active = None
         self.map.sealed(section)
-        return renders
+        return Seal(section_id=section.section_id, gaussians=section.gaussians.count, renders=renders)

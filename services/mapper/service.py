@@ -200,7 +200,6 @@ class MapperService:
             pose.quality,
             pose.covariance,
             state=FIRST_FRAME_STATE if pose.quality is None else pose.state.value,
-            seal_renders=0,
             seconds=Seconds(read_s=pose.read_s, track_s=pose.track_s, map_s=map_s, total_s=total_s),
         )
         return CommitFacts(
@@ -286,7 +285,8 @@ class MapperService:
         start_ns = self._clock.monotonic_ns()
         section, renders = self._turns.seal(active)
         seconds = 1e-9 * (self._clock.monotonic_ns() - start_ns)
-        return section, renders, self._facts.with_seal(renders=renders, seconds=seconds)
+        facts = self._facts.with_seal(gaussians=section.gaussians.count, renders=renders, seconds=seconds)
+        return section, renders, facts
 
     # --- telling others ---------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.native_engine import NativeEngine
 from vtslam.common.tracking_facts import TrackingState
-from vtslam.services.system import FrameReport, System
+from vtslam.services.system import FrameReport, Seal, System
 from vtslam.storage.section_convert import record_of, section_of
 
 N, FRAMES, PATH = 6, 15, 48  # frames of a section, of the run, of the closed path they are on
@@ -53,7 +53,7 @@ class Run:
     system: System
     reports: list[FrameReport]
     archive: MemoryArchive
-    seal_renders: int
+    seal: Seal | None
 
     @property
     def poses(self) -> npt.NDArray[np.float64]:
@@ -83,7 +83,7 @@ def run(settings: Settings, frames: list[Frame], *, threads: int = 1) -> Run:
     archive = MemoryArchive()
     system = System(settings, NativeEngine(threads=threads), archive, threads=threads)
     reports = [system.process(frame) for frame in frames]
-    return Run(system=system, reports=reports, archive=archive, seal_renders=system.finish())
+    return Run(system=system, reports=reports, archive=archive, seal=system.finish())
 
 
 @lru_cache(maxsize=1)
@@ -114,19 +114,21 @@ def test_two_runs_and_any_number_of_threads_give_the_same_bytes() -> None:
 
 def test_sections_are_sealed_when_full_and_at_the_end() -> None:
     result = plain_run()
-    sealed = [report.sealed_section_id for report in result.reports]
-    assert [i for i, section_id in enumerate(sealed) if section_id is not None] == [N - 1, 2 * N - 1]
+    sealed = [report.sealed for report in result.reports]
+    assert [i for i, seal in enumerate(sealed) if seal is not None] == [N - 1, 2 * N - 1]
     assert [len(section.frames) for section in result.archive.written.values()] == [N, N, FRAMES - 2 * N]
-    assert result.seal_renders >= 6
+    for section, seal in zip(result.archive.written.values(), [*filter(None, sealed), result.seal], strict=True):
+        assert seal is not None
+        assert seal.renders >= 6
+        assert (seal.section_id, seal.gaussians) == (section.section_id, section.gaussians.count)
     assert result.system.active is None
-    assert result.system.finish() == 0
-    assert all((report.seal_renders > 0) == (report.sealed_section_id is not None) for report in result.reports)
+    assert result.system.finish() is None
 
 
 def test_a_run_that_ends_with_a_section_has_nothing_left_to_seal() -> None:
     result = run(settings_of("mapper.iterations_seal=2"), room_frames()[:N])
     assert list(result.archive.written) == [0]
-    assert result.seal_renders == 0
+    assert result.seal is None
 
 
 def test_sections_hold_the_committed_poses_and_frames() -> None:

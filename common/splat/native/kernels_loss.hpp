@@ -23,6 +23,8 @@ VTSLAM_INLINE void store_up_to(float* p, Vec a, int n) {
     store_first(p, a, n);
 }
 
+constexpr float kLeastDepth = 1.17549435e-38f;  // zero means that there is none
+
 struct RowSpan {
   int first, last;  // rows of the window inside the image, as taps
 };
@@ -160,28 +162,46 @@ VTSLAM_INLINE void vertical_derivatives(const LossArgs& args, int row, float* sc
   for (int b = 0; b < 3; ++b) clear_padding(scratch + b * stride, args.width);
 }
 
+// scale times the sign of a - b.
+VTSLAM_INLINE Vec signed_scale(Vec a, Vec b, float scale) {
+  return where(at_least(a, b), splat(scale)) - where(at_least(b, a), splat(scale));
+}
+
+// Adds the L1 terms of one row where only some pixels count.
+VTSLAM_INLINE void add_masked_signs(const LossArgs& args, int row) {
+  for (int x = 0; x < args.width; ++x) {
+    const size_t at = size_t(row) * args.width + x;
+    const bool counted = args.mask[at] != 0;
+    for (size_t c = 3 * at; counted && c < 3 * at + 3; ++c)
+      args.d_rgb[c] += args.color_scale * sign_of(args.rgb[c] - args.target_rgb[c]);
+    const bool deep = counted && args.target_depth[at] > 0.0f;
+    args.d_depth[at] = deep ? args.depth_scale * sign_of(args.depth[at] - args.target_depth[at]) : 0.0f;
+  }
+}
+
 void loss_gradient_row(const LossArgs& args, int row, float* scratch) {
   const int n = 3 * args.width;
   const size_t stride = loss_row_floats(args.width), start = size_t(row) * args.width;
-  const bool structural = args.structural;
-  if (structural) vertical_derivatives(args, row, scratch);
-  for (int i = 0; structural && i < n; i += kLanes) {
+  const bool masked = args.mask != nullptr;
+  if (args.structural) vertical_derivatives(args, row, scratch);
+  for (int i = 0; i < n; i += kLanes) {
     const size_t at = 3 * start + i;
     const Vec a = load_up_to(args.rgb + at, n - i), b = load_up_to(args.target_rgb + at, n - i);
-    const Vec by_square = filtered(scratch + stride, i), by_product = filtered(scratch + 2 * stride, i);
-    const Vec by_pixel = fma(by_product, b, fma(by_square * splat(2.0f), a, filtered(scratch, i)));
-    store_up_to(args.d_rgb + at, by_pixel * splat(-args.ssim_scale), n - i);
-  }
-  for (int x = 0; x < args.width; ++x) {
-    const size_t at = start + x;
-    const bool counted = args.mask == nullptr || args.mask[at] != 0;
-    for (int c = 0; c < 3; ++c) {
-      const float color =
-          counted ? args.color_scale * sign_of(args.rgb[3 * at + c] - args.target_rgb[3 * at + c]) : 0.0f;
-      args.d_rgb[3 * at + c] = (structural ? args.d_rgb[3 * at + c] : 0.0f) + color;
+    Vec by_pixel = splat(0.0f);
+    if (args.structural) {
+      const Vec by_square = filtered(scratch + stride, i), by_product = filtered(scratch + 2 * stride, i);
+      by_pixel = fma(by_product, b, fma(by_square * splat(2.0f), a, filtered(scratch, i))) * splat(-args.ssim_scale);
     }
-    const bool deep = counted && args.target_depth[at] > 0.0f;
-    args.d_depth[at] = deep ? args.depth_scale * sign_of(args.depth[at] - args.target_depth[at]) : 0.0f;
+    if (!masked) by_pixel = by_pixel + signed_scale(a, b, args.color_scale);
+    store_up_to(args.d_rgb + at, by_pixel, n - i);
+  }
+  if (masked) return add_masked_signs(args, row);
+  for (int i = 0; i < args.width; i += kLanes) {
+    const size_t at = start + i;
+    const int left = args.width - i;
+    const Vec depth = load_up_to(args.depth + at, left), target = load_up_to(args.target_depth + at, left);
+    const Vec measured = signed_scale(depth, target, args.depth_scale);
+    store_up_to(args.d_depth + at, where(at_least(target, splat(kLeastDepth)), measured), left);
   }
 }
 
