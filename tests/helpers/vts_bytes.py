@@ -24,7 +24,7 @@ class VtsParts:
     header: bytes
     body: bytes
     index: bytes
-    version: int = 1
+    version: int = 2
     header_length: int | None = None
     file_size: int | None = None
     index_offset: int | None = None
