@@ -5,7 +5,7 @@ predictions from neighbouring Gaussians. Ties, depths, poses and candidate views
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from vtslam.common.geometry.camera import Camera
 from vtslam.storage import _coder
-from vtslam.storage.section_record import SectionRecord
+from vtslam.storage.section_record import SectionRecord, check_header_types
 
 AnyArray = npt.NDArray[Any]
 Ints = np.ndarray[tuple[Any, ...], np.dtype[np.int32]]
@@ -41,20 +41,37 @@ class DenseGrid:
         radius: Of log radii.
         luma: Of (red + 2 green + blue) / 4.
         chroma: Of red - blue, and of green - (red + blue) / 2.
+        faint: Below this opacity angle the other steps are doubled ...
+        fainter: ... and below this one doubled again: such Gaussians show less.
         opacity_zero: The angle at level 0.
         radius_zero: Log radius minus log(depth / focal length, of a quarter half of it) at level 0.
     """
 
-    opacity: float = 0.16
-    radius: float = 0.18
-    luma: float = 0.03
-    chroma: float = 0.05
+    opacity: float = 0.5
+    radius: float = 0.07
+    luma: float = 0.01
+    chroma: float = 0.02
+    faint: float = 1.6
+    fainter: float = 0.9
     opacity_zero: float = 0.0
     radius_zero: float = 0.0
+
+    def coarser(self, factor: float) -> "DenseGrid":
+        """The same with all steps ``factor`` times as long."""
+        steps = {name: factor * getattr(self, name) for name in ("opacity", "radius", "luma", "chroma")}
+        return replace(self, **steps)
 
     def as_dict(self) -> dict[str, float]:
         """Plain values by name."""
         return {field.name: float(getattr(self, field.name)) for field in fields(self)}
+
+    @property
+    def scales(self) -> tuple[int, int]:
+        """The opacity levels of ``faint`` and ``fainter``."""
+        faint, fainter = (
+            int(np.ceil((angle - self.opacity_zero) / self.opacity)) for angle in (self.faint, self.fainter)
+        )
+        return faint, fainter
 
     @classmethod
     def from_dict(cls, values: object) -> "DenseGrid":
@@ -94,6 +111,7 @@ def dense_columns(record: SectionRecord, grid: DenseGrid) -> tuple[dict[str, flo
         _view_of(record.view_index, record.num_frames),
         view_ranks,
         depth_values.size - 1,
+        grid.scales,
         record.pixel[order],
         record.subpixel[order],
         gaussian_ranks[order],
@@ -130,6 +148,7 @@ def gaussian_columns(
         _view_of(view_index, counts.shape[0]),
         view_ranks,
         values.size - 1,
+        grid.scales,
     )
     depth = values[rank]
     unit = header["depth_scale_m"] * header["depth_factor"]
@@ -147,11 +166,9 @@ def gaussian_columns(
 
 def _camera(header: Mapping[str, Any]) -> Camera:
     """The header's camera, and its depth units, as far as decoding needs them right."""
-    try:
-        camera = Camera(**header["camera"])
-        unit = float(header["depth_scale_m"]) * float(header["depth_factor"])
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"header: {error}") from error
+    check_header_types(header)
+    camera = Camera(**header["camera"])
+    unit = header["depth_scale_m"] * header["depth_factor"]
     if not (np.isfinite(unit) and unit > 0 and max(camera.width, camera.height) <= _LARGEST_SIDE_PX):
         raise ValueError("header: expected positive depth units, and images of at most 65535 pixels a side")
     return camera
@@ -208,7 +225,7 @@ def _levels(record: SectionRecord, grid: DenseGrid) -> tuple[Ints, DenseGrid]:
         record.depth, record.subpixel, unit_m=unit, focal_px=record.camera.mean_focal_px
     )
     zeros = (float(np.median(angle)), float(np.median(radius))) if record.num_gaussians else (0.0, 0.0)
-    grid = DenseGrid(**{**grid.as_dict(), "opacity_zero": zeros[0], "radius_zero": zeros[1]})
+    grid = replace(grid, opacity_zero=zeros[0], radius_zero=zeros[1])
     red, green, blue = record.color.astype(np.float64).T
     scaled = np.stack(
         [
@@ -222,7 +239,17 @@ def _levels(record: SectionRecord, grid: DenseGrid) -> tuple[Ints, DenseGrid]:
     )
     if scaled.size and not np.abs(scaled).max() < _LARGEST_LEVEL:
         raise ValueError("an attribute is too large for the dense form")
-    return np.rint(scaled).astype(np.int32), grid
+    return _rounded(scaled, grid), grid
+
+
+def _rounded(scaled: npt.NDArray[np.float64], grid: DenseGrid) -> Ints:
+    """Levels int32 [N,5], those but the opacity's on the coarser grids of Gaussians that show less."""
+    faint, fainter = grid.scales
+    opacity = np.rint(scaled[:, 0])
+    scale = 1 << ((opacity < faint).astype(np.int64) + (opacity < fainter))
+    levels = np.rint(scaled / scale[:, None]) * scale[:, None]
+    levels[:, 0] = opacity
+    return levels.astype(np.int32)
 
 
 def _attributes(levels: Ints, geometric: npt.NDArray[np.float64], grid: DenseGrid) -> dict[str, AnyArray]:

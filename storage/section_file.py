@@ -16,6 +16,7 @@ import numpy.typing as npt
 from vtslam.common import plain_msgpack
 from vtslam.storage.atomic import replace_file
 from vtslam.storage.column_codecs import RAW, ColumnCodec, decode_column, encode_column
+from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import (
     BadMagic,
     ChecksumMismatch,
@@ -358,18 +359,29 @@ def write_section(path: Path, record: SectionRecord, codec: SectionCodec = "loss
     _write_pieces(path, _section_pieces(path, record, codec))
 
 
-def encode_section(record: SectionRecord, codec: SectionCodec, *, name: Path) -> bytes:
-    """The bytes of a section's file; ``name`` is what errors call it.
+def encode_section(record: SectionRecord, codec: SectionCodec, *, name: Path, grid: DenseGrid | None = None) -> bytes:
+    """The bytes of a section's file.
+
+    Args:
+        record: The section.
+        codec: See :func:`vtslam.storage.section_codecs.encoded_record`.
+        name: What errors call the file.
+        grid: What ``dense`` rounds to; None for the usual grid.
 
     Raises:
         MalformedSection: The codec cannot hold this section.
     """
-    return b"".join(_section_pieces(name, record, codec))
+    return b"".join(_section_pieces(name, record, codec, grid))
 
 
 def decode_section(data: bytes, *, name: Path) -> SectionRecord:
     """The section in a file's bytes, as :func:`read_section`."""
     return _section_in(BytesIO(data), name)
+
+
+def column_bytes(data: bytes, *, name: Path) -> dict[str, int]:
+    """Stored bytes of each column of a file's bytes; raises StorageError."""
+    return {entry.name: entry.length for entry in _read_layout(BytesIO(data), name).entries}
 
 
 def read_section(path: Path) -> SectionRecord:
@@ -395,9 +407,11 @@ def repack_section(path: Path, codec: SectionCodec) -> bool:
     return True
 
 
-def _section_pieces(path: Path, record: SectionRecord, codec: SectionCodec) -> list[bytes | memoryview]:
+def _section_pieces(
+    path: Path, record: SectionRecord, codec: SectionCodec, grid: DenseGrid | None = None
+) -> list[bytes | memoryview]:
     try:
-        return encoded_columns(*encoded_record(record, codec))
+        return encoded_columns(*encoded_record(record, codec, grid))
     except ValueError as error:
         raise MalformedSection(f"{path}: cannot be written: {error}") from error
 

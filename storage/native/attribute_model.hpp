@@ -70,24 +70,32 @@ class Predictor {
 class AttributeModel {
  public:
   template <typename Coder, typename Level>
-  void code(Coder& coder, const Neighbourhood& near, const Known& latest, Level* values, Known& out) {
-    Levels errors_to_mean{};
+  void code(Coder& coder, const Coarseness& coarseness, const Neighbourhood& near, const Known& latest, Level* values,
+            Known& out) {
+    int32_t scale = 1;
+    Levels own_errors{};
     for (int channel = 0; channel < kChannels; ++channel) {
       Predictor& predictor = predictors_[channel];
-      const double guess = predictor.predicted(near, errors_to_mean, channel, latest.levels[channel]);
-      const double rounded = std::floor(guess + 0.5);
+      const double guess = predictor.predicted(near, own_errors, channel, latest.levels[channel]);
+      const double scaled = guess / scale;
+      const double rounded = std::floor(scaled + 0.5);
       if (!(std::fabs(rounded) < AdaptiveNumber::kLargest)) throw std::invalid_argument("a guess is out of range");
       const int32_t whole = static_cast<int32_t>(rounded);
-      AdaptiveNumber& number = numbers_[channel][activity(near, channel)][beside(out, channel)];
-      const int32_t wanted = Coder::kDecodes ? 0 : values[channel] - whole;
-      const int32_t error = number.code(coder, wanted, lean(guess - rounded));
-      const int32_t found = whole + error;
+      AdaptiveNumber& number = numbers_[channel][activity(near, channel, scale)][beside(own_errors, channel)];
+      const int32_t wanted = Coder::kDecodes ? 0 : values[channel] / scale - whole;
+      const int32_t error = number.code(coder, wanted, lean(scaled - rounded));
+      const int32_t found = (whole + error) * scale;
       if (std::abs(found) > AdaptiveNumber::kLargest) throw std::invalid_argument("a level is out of range");
-      if constexpr (Coder::kDecodes) values[channel] = found;
+      if constexpr (Coder::kDecodes) {
+        values[channel] = found;
+      } else if (values[channel] != found) {
+        throw std::invalid_argument("a level is not on its coarser grid");
+      }
       predictor.learn(found);
-      errors_to_mean[channel] = error;
+      own_errors[channel] = error;
       out.levels[channel] = found;
-      out.errors[channel] = std::abs(error);
+      out.errors[channel] = std::abs(error) * scale;
+      if (channel == 0) scale = coarseness.scale(found);
     }
   }
 
@@ -95,20 +103,20 @@ class AttributeModel {
   static constexpr int kActivities = 8, kBeside = 4;
 
   // How far off the guesses nearby were.
-  static int activity(const Neighbourhood& near, int channel) {
+  static int activity(const Neighbourhood& near, int channel, int32_t scale) {
     int32_t sum = 0, present = 0;
     for (const Known* known : near) {
       if (!known) continue;
       sum += known->errors[channel];
       ++present;
     }
-    return present ? magnitude_bucket(2 * sum / present) : kActivities - 1;
+    return present ? magnitude_bucket(2 * sum / (present * scale)) : kActivities - 1;
   }
 
   // How far off the guesses of this Gaussian's earlier channels were.
-  static int beside(const Known& own, int channel) {
+  static int beside(const Levels& errors, int channel) {
     if (channel == 0) return 0;
-    const int32_t last = own.errors[channel - 1] + (channel == 4 ? own.errors[2] : 0);
+    const int32_t last = std::abs(errors[channel - 1]) + (channel == 4 ? std::abs(errors[2]) : 0);
     return last == 0 ? 0 : last == 1 ? 1 : last < 4 ? 2 : 3;
   }
 

@@ -56,8 +56,10 @@ vtslam::ImageSize image_size(std::tuple<int64_t, int64_t, int64_t> shape) {
   return {images, height, width};
 }
 
+using Scales = std::tuple<int32_t, int32_t>;  // vtslam::Coarseness
+
 vtslam::TiedGaussians ties_of(std::tuple<int64_t, int64_t> size, In<uint32_t, 2> counts, In<int32_t, 1> view_of,
-                              In<int32_t, 3> view_ranks, int32_t largest_rank) {
+                              In<int32_t, 3> view_ranks, int32_t largest_rank, Scales scales) {
   const auto [height, width] = size;
   const int64_t frames = static_cast<int64_t>(counts.shape(0)), views = static_cast<int64_t>(view_ranks.shape(0));
   require(height > 0 && width > 0 && width < 65536 && height < 65536, "size: expected 1 to 65535 pixels each way");
@@ -68,7 +70,8 @@ vtslam::TiedGaussians ties_of(std::tuple<int64_t, int64_t> size, In<uint32_t, 2>
   for (int64_t frame = 0; frame < frames; ++frame) {
     require(view_of.data()[frame] >= -1 && view_of.data()[frame] < views, "view_of: no such view");
   }
-  return {frames, height, width, counts.data(), view_of.data(), view_ranks.data(), largest_rank};
+  const auto [faint, fainter] = scales;
+  return {frames, height, width, counts.data(), view_of.data(), view_ranks.data(), largest_rank, {faint, fainter}};
 }
 
 size_t total(In<uint32_t, 2> counts) {
@@ -125,9 +128,9 @@ NB_MODULE(_coder, m) {
   m.def(
       "encode_gaussians",
       [](std::tuple<int64_t, int64_t> size, In<uint32_t, 2> counts, In<int32_t, 1> view_of, In<int32_t, 3> view_ranks,
-         int32_t largest_rank, In<int32_t, 1> pixel, In<uint8_t, 1> subpixel, In<int32_t, 1> rank,
+         int32_t largest_rank, Scales scales, In<int32_t, 1> pixel, In<uint8_t, 1> subpixel, In<int32_t, 1> rank,
          In<int32_t, 2> levels) {
-        const vtslam::TiedGaussians ties = ties_of(size, counts, view_of, view_ranks, largest_rank);
+        const vtslam::TiedGaussians ties = ties_of(size, counts, view_of, view_ranks, largest_rank, scales);
         const size_t count = total(counts);
         require(pixel.shape(0) == count && subpixel.shape(0) == count && rank.shape(0) == count &&
                     levels.shape(0) == count && levels.shape(1) == vtslam::kChannels,
@@ -139,13 +142,13 @@ NB_MODULE(_coder, m) {
         }
         return bytes_of(out);
       },
-      "size"_a, "counts"_a, "view_of"_a, "view_ranks"_a, "largest_rank"_a, "pixel"_a, "subpixel"_a, "rank"_a,
-      "levels"_a, "Gaussians in the order of the format's section 6; ValueError if they are not.");
+      "size"_a, "counts"_a, "view_of"_a, "view_ranks"_a, "largest_rank"_a, "scales"_a, "pixel"_a, "subpixel"_a,
+      "rank"_a, "levels"_a, "Gaussians in the order of the format's section 6; ValueError if they are not.");
   m.def(
       "decode_gaussians",
       [](nb::bytes data, std::tuple<int64_t, int64_t> size, In<uint32_t, 2> counts, In<int32_t, 1> view_of,
-         In<int32_t, 3> view_ranks, int32_t largest_rank) -> Decoded {
-        const vtslam::TiedGaussians ties = ties_of(size, counts, view_of, view_ranks, largest_rank);
+         In<int32_t, 3> view_ranks, int32_t largest_rank, Scales scales) -> Decoded {
+        const vtslam::TiedGaussians ties = ties_of(size, counts, view_of, view_ranks, largest_rank, scales);
         const size_t count = total(counts);
         vtslam::GaussiansOut out{};
         auto levels = filled<int32_t>(count * vtslam::kChannels, [&](int32_t* p) { out.levels = p; });
@@ -157,6 +160,6 @@ NB_MODULE(_coder, m) {
         });
         return {pixel, subpixel, rank, levels};
       },
-      "data"_a, "size"_a, "counts"_a, "view_of"_a, "view_ranks"_a, "largest_rank"_a,
+      "data"_a, "size"_a, "counts"_a, "view_of"_a, "view_ranks"_a, "largest_rank"_a, "scales"_a,
       "Pixels, sub-pixels, places of depths, levels (flat); ValueError if the bytes are not theirs.");
 }

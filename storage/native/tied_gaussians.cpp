@@ -169,7 +169,7 @@ class Stream {
     }
     const Neighbourhood near = neighbourhood(row, column, kind);
     Known found;
-    models_[kind]->code(coder_, near, latest_[kind], columns_.levels + kChannels * index, found);
+    models_[kind]->code(coder_, ties_.coarseness, near, latest_[kind], columns_.levels + kChannels * index, found);
     latest_[kind] = found;
     known_.row(row)[column] = found;
     seen_in_pixel_ = pixel;

@@ -10,6 +10,13 @@ namespace vtslam {
 
 constexpr int kChannels = 5;  // opacity, radius, luma, two chroma
 
+// Gaussians that show less have coarser grids: their levels, all but the opacity's, are multiples of a scale.
+struct Coarseness {
+  int32_t faint, fainter;  // opacity levels below which the scale doubles, and doubles again
+
+  int32_t scale(int32_t opacity_level) const { return 1 << ((opacity_level < faint) + (opacity_level < fainter)); }
+};
+
 // Frames one after another. In a frame the `whole` Gaussians (sub-pixel 0) come first, by pixel, then the `quarters`
 // (1 to 4), by pixel and sub-pixel.
 struct TiedGaussians {
@@ -18,6 +25,7 @@ struct TiedGaussians {
   const int32_t* view_of;     // [frames]: the frame's depth image, or -1
   const int32_t* view_ranks;  // [views, height, width]: places in the list of depths, 0 for no depth
   int32_t largest_rank;
+  Coarseness coarseness;
 };
 
 // What is coded, [N] or [N, kChannels]; written to by the decoder.
