@@ -247,9 +247,9 @@ def _rounded(scaled: npt.NDArray[np.float64], grid: DenseGrid) -> Ints:
     faint, fainter = grid.scales
     opacity = np.rint(scaled[:, 0])
     scale = 1 << ((opacity < faint).astype(np.int64) + (opacity < fainter))
-    levels = np.rint(scaled / scale[:, None]) * scale[:, None]
+    levels = (np.rint(scaled / scale[:, None]) * scale[:, None]).astype(np.int32)
     levels[:, 0] = opacity
-    return levels.astype(np.int32)
+    return levels
 
 
 def _attributes(levels: Ints, geometric: npt.NDArray[np.float64], grid: DenseGrid) -> dict[str, AnyArray]:

@@ -74,12 +74,13 @@ def bench_codec(plan: RunPlan, *, curves: bool, on_step: Callable[[], None] = la
         recording = _recording_bytes(plan.source)
         reference = _quality(plain, lambda record: record)
         found: dict[str, object] = {}
-        for name, run, codec in (
+        stored: tuple[tuple[str, RecordedRun, SectionCodec], ...] = (
             ("lossless", plain, "lossless"),
             ("fast", plain, "fast"),
             ("dense", plain, "dense"),
             ("dense_rate", rated, "dense"),
-        ):
+        )
+        for name, run, codec in stored:
             found[name] = _stored(run, codec, reference, recording)
             on_step()
         if curves:

@@ -65,8 +65,22 @@ class TieModel {
 // Ranks of the depths at the pixels of one frame that have Gaussians.
 class DepthModel {
  public:
+  // `seen`: the pixel's rank in the frame's own depth image, or 0. It is almost always the one.
   template <typename Coder>
-  int32_t code(Coder& coder, const int32_t* here, const int32_t* above, int32_t value, int32_t largest) {
+  int32_t code(Coder& coder, const int32_t* here, const int32_t* above, int32_t seen, int32_t value, int32_t largest) {
+    const Guess guess = seen ? Guess{seen, kOfView} : guessed(here, above);
+    latest_ = guess.rank + residuals_[guess.context].code(coder, value - guess.rank, 0);
+    if (latest_ < 1 || latest_ > largest) throw std::invalid_argument("a depth is outside of its list");
+    return latest_;
+  }
+
+ private:
+  struct Guess {
+    int32_t rank;
+    int context;
+  };
+
+  Guess guessed(const int32_t* here, const int32_t* above) const {
     const int32_t near[] = {here[-1], above[0], above[-1], above[1], here[-2], above[2]};
     int32_t guess = latest_, spread = 60;
     int present = 0;
@@ -80,15 +94,12 @@ class DepthModel {
     if (near[0] && near[1]) guess = (near[0] + near[1]) / 2;
     if (near[0] && near[1] && near[2]) guess = std::clamp(near[0] + near[1] - near[2], low, high);
     if (present > 1) spread = high - low;
-    const int context = std::min(present, 3) * 8 + magnitude_bucket(spread / 2);
-    latest_ = guess + residuals_[context].code(coder, value - guess, 0);
-    if (latest_ < 1 || latest_ > largest) throw std::invalid_argument("a depth is outside of its list");
-    return latest_;
+    return {guess, std::min(present, 3) * 8 + magnitude_bucket(spread / 2)};
   }
 
- private:
+  static constexpr int kOfView = 32;
   int32_t latest_ = 1;
-  AdaptiveNumber residuals_[32];
+  AdaptiveNumber residuals_[kOfView + 1];
 };
 
 template <typename Coder, typename Columns>
@@ -135,9 +146,8 @@ class Stream {
                                                    tied_.row(row - 2) + column, state, wanted(pixel)));
     if (!*tied) return;
     int32_t* const rank = ranks_.row(row) + column;
-    *rank = view_rank;
-    if (!view_rank)
-      *rank = depth_model_->code(coder_, rank, ranks_.row(row - 1) + column, wanted_rank(*tied), ties_.largest_rank);
+    *rank = depth_model_->code(coder_, rank, ranks_.row(row - 1) + column, view_rank, wanted_rank(*tied),
+                               ties_.largest_rank);
     for (int sub = 0; sub < 5; ++sub) {
       if (*tied >> sub & 1) code_gaussian(row, column, pixel, sub, *rank);
     }

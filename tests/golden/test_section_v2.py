@@ -10,22 +10,22 @@ from vtslam.storage.section_file import read_section, verify_file, write_section
 
 FOLDER = Path(__file__).parent
 SHA256 = {
-    "raw": "",
-    "lossless": "",
-    "fast": "",
-    "dense": "",
+    "raw": "18d5763fbc1c8c4f64dc525e748471dca03b48d064c5396706f13b9bb117ba47",
+    "lossless": "c99aaa480c8b81af896944cdc70657c7f8a186d0b9a09d977ec76b2c0faf79cf",
+    "fast": "21923a197bb66eb0c02c9b6c9ded0d345e2d424447d40626f42f0560fb88bc93",
+    "dense": "0e0eaaeb834bab41fad8954d764b6fd4069b8d8955fd08553868feeaf404cd49",
 }
 # Largest errors of rounding, and the first values as they were read on the day the files were written.
-ROUNDED = {
+ROUNDED: dict[str, dict[str, tuple[float, list[float]]]] = {
     "fast": {
-        "color": (0.002, []),
-        "log_radius": (0.008, []),
-        "opacity_logit": (0.016, []),
+        "color": (0.002, [-0.125, -0.109375, -0.09375, -0.078125]),
+        "log_radius": (0.008, [-3.992188, -4.007812, -4.007812, -4.023438]),
+        "opacity_logit": (0.016, [-1.0, -0.875, -0.75, -0.625]),
     },
     "dense": {
-        "color": (0.05, []),
-        "log_radius": (0.15, []),
-        "opacity_logit": (1.0, []),
+        "color": (0.05, [-0.12, -0.1, -0.08, 0.57]),
+        "log_radius": (0.15, [-3.94449, -4.131622, -4.152459, -4.067896]),
+        "opacity_logit": (1.0, [-0.836215, 1.263692, 1.263692, 0.187409]),
     },
 }
 
