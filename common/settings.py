@@ -294,9 +294,11 @@ class StorageSettings:
     Attributes:
         codec: How a finished run leaves them: raw and lossless keep every bit, fast and dense round learned attributes.
             While a run lasts they are lossless, so that the map does not depend on which sections were read again.
+        coarseness: Factor on the steps that dense rounds to; 1 costs less than 0.1 dB, 2 about 0.2 dB.
     """
 
     codec: Literal["raw", "lossless", "fast", "dense"] = "lossless"
+    coarseness: Annotated[float, Range(0.1, 10.0)] = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,7 @@ import numpy as np
 
 from vtslam.common.trajectory_io import write_trajectory
 from vtslam.services.frame_facts import CommittedFrame
+from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.run_folder import RunFolder
 
 _WRITTEN_CODEC = "lossless"  # of sections as they are written; with it there is nothing to repack
@@ -90,7 +91,10 @@ class RunRecord:
             peak_rss_mb=peak_rss_mb,
         )
         self._run.write_info(replace(info, facts=facts))
-        self._run.repack_sections(info.settings.get("storage", {}).get("codec", _WRITTEN_CODEC))
+        storage = info.settings.get("storage", {})
+        self._run.repack_sections(
+            storage.get("codec", _WRITTEN_CODEC), DenseGrid().coarser(storage.get("coarseness", 1.0))
+        )
         return summary
 
     def _summary(self, *, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:

@@ -47,10 +47,10 @@ class DenseGrid:
         radius_zero: Log radius minus log(depth / focal length, of a quarter half of it) at level 0.
     """
 
-    opacity: float = 0.5
-    radius: float = 0.07
-    luma: float = 0.01
-    chroma: float = 0.02
+    opacity: float = 0.4
+    radius: float = 0.056
+    luma: float = 0.008
+    chroma: float = 0.016
     faint: float = 1.6
     fainter: float = 0.9
     opacity_zero: float = 0.0

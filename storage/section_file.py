@@ -354,9 +354,11 @@ def _fill(file: Source, path: Path, offset: int, target: memoryview) -> None:
 # --- sections --------------------------------------------------------------------------------------------------------
 
 
-def write_section(path: Path, record: SectionRecord, codec: SectionCodec = "lossless") -> None:
-    """Write a section to ``path``; see :func:`write_columns`."""
-    _write_pieces(path, _section_pieces(path, record, codec))
+def write_section(
+    path: Path, record: SectionRecord, codec: SectionCodec = "lossless", grid: DenseGrid | None = None
+) -> None:
+    """Write a section to ``path``; see :func:`write_columns` and :func:`encode_section`."""
+    _write_pieces(path, _section_pieces(path, record, codec, grid))
 
 
 def encode_section(record: SectionRecord, codec: SectionCodec, *, name: Path, grid: DenseGrid | None = None) -> bytes:
@@ -394,8 +396,10 @@ def read_section(path: Path) -> SectionRecord:
         return _section_in(file, path)
 
 
-def repack_section(path: Path, codec: SectionCodec) -> bool:
+def repack_section(path: Path, codec: SectionCodec, grid: DenseGrid | None = None) -> bool:
     """Replace a section's file by one in another codec, as a whole; whether it was not in that codec already.
+
+    What ``fast`` or ``dense`` rounded stays rounded. ``grid`` is what ``dense`` rounds to, None the usual one.
 
     Raises:
         StorageError: It cannot be read or written, and is as it was.
@@ -403,7 +407,7 @@ def repack_section(path: Path, codec: SectionCodec) -> bool:
     header, columns = read_columns(path)
     if codec_of_header(header) == codec:
         return False
-    write_section(path, _record(path, header, columns), codec)
+    write_section(path, _record(path, header, columns), codec, grid)
     return True
 
 

@@ -22,7 +22,7 @@ from vtslam.storage.section_convert import section_of
 from vtslam.storage.section_file import column_bytes, decode_section, encode_section
 from vtslam.storage.section_record import SectionRecord
 
-RATE_WEIGHT = 0.3  # of `dense_rate`, unless the settings have one
+RATE_WEIGHT, RATE_COARSENESS = 0.1, 1.6  # of `dense_rate`; the weight unless the settings have one
 OTHER_FORMATS = {"ply_3dgs": 248, "splatam_14_floats": 56, "vtgaussian_released": 64}  # bytes per Gaussian, raw
 _HOLDOUT, _EVALUATED_INTERVAL = 8, 5
 _CURVE_FACTORS = (0.5, 0.71, 1.0, 1.41, 2.0, 2.83)
@@ -74,21 +74,27 @@ def bench_codec(plan: RunPlan, *, curves: bool, on_step: Callable[[], None] = la
         recording = _recording_bytes(plan.source)
         reference = _quality(plain, lambda record: record)
         found: dict[str, object] = {}
-        stored: tuple[tuple[str, RecordedRun, SectionCodec], ...] = (
-            ("lossless", plain, "lossless"),
-            ("fast", plain, "fast"),
-            ("dense", plain, "dense"),
-            ("dense_rate", rated, "dense"),
+        coarser = DenseGrid().coarser(RATE_COARSENESS)
+        stored: tuple[tuple[str, RecordedRun, SectionCodec, DenseGrid | None], ...] = (
+            ("lossless", plain, "lossless", None),
+            ("fast", plain, "fast", None),
+            ("dense", plain, "dense", None),
+            ("dense_rate", rated, "dense", coarser),
         )
-        for name, run, codec in stored:
-            found[name] = _stored(run, codec, reference, recording)
+        for name, run, codec, grid in stored:
+            found[name] = _stored(run, codec, grid, reference, recording)
             on_step()
         if curves:
             found["curves"] = {
                 name: [_point(run, factor, on_step) for factor in _CURVE_FACTORS]
                 for name, run in (("dense", plain), ("dense_rate", rated))
             }
-    settings = {"rate_weight": weight, "bytes_per_gaussian_of_others": OTHER_FORMATS, "recording_bytes": recording}
+    settings = {
+        "rate_weight": weight,
+        "rate_coarseness": RATE_COARSENESS,
+        "bytes_per_gaussian_of_others": OTHER_FORMATS,
+        "recording_bytes": recording,
+    }
     return {**found, "reference": asdict(reference), **settings}
 
 
@@ -112,11 +118,11 @@ def _mapped(plan: RunPlan, path: Path, *, rate_weight: float, on_done: Callable[
 
 
 def _stored(
-    run: RecordedRun, codec: SectionCodec, reference: Quality, recording_bytes: int
+    run: RecordedRun, codec: SectionCodec, grid: DenseGrid | None, reference: Quality, recording_bytes: int
 ) -> dict[str, float | bool | None]:
     """A codec's figures on a run."""
     sums = _Sums()
-    quality = _quality(run, partial(_through, codec=codec, grid=None, sums=sums))
+    quality = _quality(run, partial(_through, codec=codec, grid=grid, sums=sums))
     return {
         "bytes_per_gaussian": round((sums.file_bytes - sums.view_bytes) / sums.gaussians, 4),
         "file_bytes_per_gaussian": round(sums.file_bytes / sums.gaussians, 4),

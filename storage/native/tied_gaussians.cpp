@@ -128,7 +128,7 @@ class Stream {
       for (int64_t column = 0; column < ties_.width; ++column) code_pixel(row, column);
     }
     if (next_[0] != end_[0] || next_[1] != end_[1])
-      throw std::invalid_argument("Gaussians are missing or out of order");
+      throw std::invalid_argument("Gaussians are doubled, missing or out of order");
   }
 
   void clear(int64_t row) {
