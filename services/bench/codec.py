@@ -22,10 +22,10 @@ from vtslam.storage.section_convert import section_of
 from vtslam.storage.section_file import column_bytes, decode_section, encode_section
 from vtslam.storage.section_record import SectionRecord
 
-RATE_WEIGHT, RATE_COARSENESS = 0.1, 1.6  # of `dense_rate`; the weight unless the settings have one
+RATE_WEIGHT, RATE_COARSENESS = 0.05, 1.4  # of `dense_rate`; the weight unless the settings have one
 OTHER_FORMATS = {"ply_3dgs": 248, "splatam_14_floats": 56, "vtgaussian_released": 64}  # bytes per Gaussian, raw
 _HOLDOUT, _EVALUATED_INTERVAL = 8, 5
-_CURVE_FACTORS = (0.5, 0.71, 1.0, 1.41, 2.0, 2.83)
+_CURVE_FACTORS = (0.6, 1.0, 1.6, 2.5)
 _VIEW_COLUMNS = ("view_depth", "view_stream", "view_index")
 _REPEATS = 2
 
