@@ -247,7 +247,7 @@ def _rounded(scaled: npt.NDArray[np.float64], grid: DenseGrid) -> Ints:
     faint, fainter = grid.scales
     opacity = np.rint(scaled[:, 0])
     scale = 1 << ((opacity < faint).astype(np.int64) + (opacity < fainter))
-    levels = (np.rint(scaled / scale[:, None]) * scale[:, None]).astype(np.int32)
+    levels: Ints = (np.rint(scaled / scale[:, None]) * scale[:, None]).astype(np.int32)
     levels[:, 0] = opacity
     return levels
 

@@ -145,6 +145,7 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     codec = kinds.add_parser("codec", help="sections stored in each codec: bytes, quality lost, speed")
     codec.add_argument("--source", required=True, metavar="SOURCE", help=SOURCE_HELP)
     codec.add_argument("--curves", action="store_true", help="also coarser and finer grids of the dense codec")
+    codec.add_argument("--picture", type=Path, metavar="FILE", help="draw the curves (with --curves), PNG or JPEG")
     fleet = kinds.add_parser("fleet", help="a run as processes, beside the same in one process; delays in realtime")
     fleet.add_argument("--rounds", type=int, default=1, metavar="N", help="runs of each kind (default: %(default)s)")
     fleet.add_argument(

@@ -131,7 +131,9 @@ def test_a_fleet_under_fire_loses_nothing(small: SmallRecording) -> None:
 
 def test_codec_reports_bytes_quality_and_speed(tmp_path: Path) -> None:
     source = ["--source", "sim:room?frames=8", "--size", "64x48", "--set", "section.length=4", "--holdout", "3"]
-    values = bench("codec", *source, "--curves", result=tmp_path / "codec.json")
+    picture = tmp_path / "codec.png"
+    values = bench("codec", *source, "--curves", "--picture", str(picture), result=tmp_path / "codec.json")
+    assert picture.stat().st_size > 1000
     sizes = [values[codec]["bytes_per_gaussian"] for codec in ("lossless", "fast", "dense")]
     assert sizes == sorted(sizes, reverse=True)
     assert values["lossless"]["exact"]
