@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO, FileIO
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from vtslam.common import plain_msgpack
 from vtslam.storage.atomic import replace_file
-from vtslam.storage.column_codecs import RAW, ColumnCodec, decode_column, encode_column
+from vtslam.storage.column_codecs import ColumnCodec, decode_column
 from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import (
     BadMagic,
@@ -26,21 +25,17 @@ from vtslam.storage.errors import (
     UnsupportedVersion,
 )
 from vtslam.storage.section_codecs import SectionCodec, codec_of_header, decoded_record, encoded_record
+from vtslam.storage.section_encoding import encoded_columns
 from vtslam.storage.section_layout import (
     CRC,
     DTYPES,
     END_MARK,
     FOOTER,
-    FORMAT_VERSION,
     INDEX_REFERENCE,
     MAGIC,
-    MAX_COLUMNS,
-    MAX_DIMENSIONS,
-    NAME,
     PRELUDE,
     READABLE_VERSIONS,
     Entry,
-    aligned,
     check_crc,
     check_equal,
     check_places,
@@ -51,7 +46,6 @@ from vtslam.storage.section_record import SectionRecord
 
 AnyArray = npt.NDArray[Any]
 Source = FileIO | BytesIO
-_AS_IS = ColumnCodec(name=RAW)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,92 +88,12 @@ def write_columns(
     _write_pieces(path, pieces)
 
 
-def encoded_columns(
-    header: Mapping[str, Any], columns: Mapping[str, AnyArray], codecs: Mapping[str, ColumnCodec] | None = None
-) -> list[bytes | memoryview]:
-    """The bytes of the file that :func:`write_columns` would write, in pieces; ValueError if it cannot be."""
-    return list(_encoded(dict(header), columns, codecs or {}))
-
-
 def _write_pieces(path: Path, pieces: Sequence[bytes | memoryview]) -> None:
     replace_file(path, pieces)
     written = FOOTER.unpack(pieces[-1])[1]
     found = verify_file(path)
     if found != written:
         raise ChecksumMismatch.differing(path, "SHA-256 read back", expected=written.hex(), found=found.hex())
-
-
-def _encoded(
-    header: dict[str, Any], columns: Mapping[str, AnyArray], codecs: Mapping[str, ColumnCodec]
-) -> Iterator[bytes | memoryview]:
-    """The file's bytes, piece by piece; the last piece is the footer."""
-    header_bytes = plain_msgpack.pack(header)
-    arrays = {name: _stored(name, columns[name]) for name in sorted(columns)}
-    if len(arrays) > MAX_COLUMNS:
-        raise ValueError(f"there are {len(arrays)} columns, at most {MAX_COLUMNS} fit")
-    entries, chunks, end = [], {}, PRELUDE.size + len(header_bytes)
-    for name, array in arrays.items():
-        codec, chunk = encode_column(array, codecs.get(name, _AS_IS))
-        chunks[name] = chunk
-        offset = aligned(end)
-        end = offset + chunk.nbytes
-        entries.append(
-            Entry(
-                name=name,
-                dtype_name=array.dtype.name,
-                shape=array.shape,
-                offset=offset,
-                length=chunk.nbytes,
-                codec=codec,
-                crc32=zlib.crc32(chunk.data),
-            )
-        )
-    index_bytes = plain_msgpack.pack([entry.as_list() for entry in entries])
-    index_offset = aligned(end)
-    file_size = index_offset + len(index_bytes) + FOOTER.size
-
-    digest = hashlib.sha256()
-    for piece in _body(header_bytes, file_size, entries, chunks, index_offset, index_bytes):
-        digest.update(piece)
-        yield piece
-    checked = INDEX_REFERENCE.pack(index_offset, len(index_bytes), zlib.crc32(index_bytes))
-    digest.update(checked)
-    yield FOOTER.pack(checked, digest.digest(), zlib.crc32(checked + digest.digest()), END_MARK)
-
-
-def _body(
-    header_bytes: bytes,
-    file_size: int,
-    entries: Sequence[Entry],
-    chunks: Mapping[str, npt.NDArray[np.uint8]],
-    index_offset: int,
-    index_bytes: bytes,
-) -> Iterator[bytes | memoryview]:
-    """Everything before the footer."""
-    fields = (MAGIC, FORMAT_VERSION, len(header_bytes), file_size, zlib.crc32(header_bytes))
-    prelude = PRELUDE.pack(*fields, 0)[: -CRC.size]
-    yield prelude + CRC.pack(zlib.crc32(prelude))
-    yield header_bytes
-    end = PRELUDE.size + len(header_bytes)
-    for entry in entries:
-        yield bytes(entry.offset - end)
-        yield chunks[entry.name].data
-        end = entry.offset + entry.length
-    yield bytes(index_offset - end)
-    yield index_bytes
-
-
-def _stored(name: str, array: AnyArray) -> AnyArray:
-    """``array`` little-endian and in C order (copied only if it is not), if the format can hold it."""
-    if not NAME.fullmatch(name):
-        raise ValueError(f"a column's name must match {NAME.pattern}, got {name!r:.80}")
-    dtype = DTYPES.get(array.dtype.name)
-    if dtype is None or array.ndim > MAX_DIMENSIONS:
-        raise ValueError(
-            f"column {name!r} must be one of {', '.join(DTYPES)} with at most {MAX_DIMENSIONS} dimensions, "
-            f"got {array.dtype} {array.shape}"
-        )
-    return np.asarray(array, dtype=dtype, order="C")
 
 
 def read_columns(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, AnyArray]]:
