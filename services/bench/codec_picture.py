@@ -12,7 +12,7 @@ from vtslam.storage.errors import WriteFailed
 
 _QUALITIES = {"psnr_heldout_db": "held-out frames", "psnr_paper_db": "training frames"}
 _COLORS = {"dense": ESTIMATED_COLOR, "dense_rate": TRUE_COLOR}
-_DOTS = ("fast", "dense", "dense_rate")
+_DOTS = ("dense", "dense_rate")
 _SIZE_PX = (480, 380)
 
 
@@ -30,7 +30,7 @@ def write_codec_picture(path: Path, found: Mapping[str, Any]) -> None:
 def _panel(found: Mapping[str, Any], key: str, words: str) -> Panel:
     lines = [Line(points=_points(found["curves"][name], key), color=color) for name, color in _COLORS.items()]
     return Panel(
-        title=f"{words} (blue: dense, gray: dense_rate, right: fast)",
+        title=f"{words} (blue: dense, gray: dense_rate)",
         x_label="B/Gaussian",
         y_label="dB",
         lines=lines,
