@@ -218,6 +218,8 @@ class MapperSettings:
         uncovered_silhouette: Pixels with a smaller silhouette get Gaussians.
         uncovered_depth_factor: So do those whose rendered depth lies behind by this many median errors; 0 never.
         uncovered_color_error: So do those whose mean channel difference is larger than this; 0 never.
+        rate_weight: Pull of colours, radii and opacities towards their first values, which dense section files store
+            for less, as a share of Adam's longest step; 0 for none.
         bundle_rotation_rate: Adam's rate of a head's rotation while it is mapped, radians; 0 keeps it.
         bundle_translation_rate: The same for its translation, metres.
     """
@@ -254,6 +256,7 @@ class MapperSettings:
     uncovered_silhouette: Fraction = 0.5
     uncovered_depth_factor: NonNegative = 50.0
     uncovered_color_error: NonNegative = 0.0
+    rate_weight: Fraction = 0.0
     bundle_rotation_rate: NonNegative = 1e-4
     bundle_translation_rate: NonNegative = 1e-4
 
@@ -285,13 +288,27 @@ class FleetSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StorageSettings:
+    """Section files.
+
+    Attributes:
+        codec: How a finished run leaves them: raw and lossless keep every bit, fast and dense round learned attributes.
+            While a run lasts they are lossless, so that the map does not depend on which sections were read again.
+        coarseness: Factor on the steps that dense rounds to; 1 costs less than 0.1 dB, 2 about 0.2 dB.
+    """
+
+    codec: Literal["raw", "lossless", "fast", "dense"] = "lossless"
+    coarseness: Annotated[float, Range(0.1, 10.0)] = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """All settings of a run.
 
     Attributes:
         seed: Key of every random choice.
         holdout: Every so many regular frames one is tracked but kept out of mapping; 0 none.
-        source, splat, section, tracker, mapper, fleet: The parts.
+        source, splat, section, tracker, mapper, storage, fleet: The parts.
     """
 
     seed: Annotated[int, Range(0, 2**31)] = 2
@@ -301,4 +318,5 @@ class Settings:
     section: SectionSettings = field(default_factory=SectionSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     mapper: MapperSettings = field(default_factory=MapperSettings)
+    storage: StorageSettings = field(default_factory=StorageSettings)
     fleet: FleetSettings = field(default_factory=FleetSettings)

@@ -6,7 +6,10 @@ import numpy as np
 
 from vtslam.common.trajectory_io import write_trajectory
 from vtslam.services.frame_facts import CommittedFrame
+from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.run_folder import RunFolder
+
+_WRITTEN_CODEC = "lossless"  # of sections as they are written; with it there is nothing to repack
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +71,7 @@ class RunRecord:
         self._run.write_frames(asdict(frame.facts) for frame in self._frames)
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
-        """Write everything that is not written yet, and what it came to.
+        """Write everything that is not written yet, sections in the codec that the settings ask for; what it came to.
 
         Args:
             finished: The run came to its end.
@@ -88,6 +91,10 @@ class RunRecord:
             peak_rss_mb=peak_rss_mb,
         )
         self._run.write_info(replace(info, facts=facts))
+        storage = info.settings.get("storage", {})
+        self._run.repack_sections(
+            storage.get("codec", _WRITTEN_CODEC), DenseGrid().coarser(storage.get("coarseness", 1.0))
+        )
         return summary
 
     def _summary(self, *, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:

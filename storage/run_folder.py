@@ -20,10 +20,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from vtslam.storage.atomic import is_temporary, replace_file, sweep_temporaries, sync_folder
+from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked, WriteFailed
 from vtslam.storage.frame_rows import read_rows, write_rows
 from vtslam.storage.run_info import RunInfo, read_run_info
-from vtslam.storage.section_file import read_section, write_section
+from vtslam.storage.section_codecs import SectionCodec
+from vtslam.storage.section_file import read_section, repack_section, write_section
 from vtslam.storage.section_record import SectionRecord
 
 _INFO, _TRAJECTORY, _FRAMES, _SECTIONS, _LOCK = "run.toml", "trajectory.txt", "frames.jsonl", "sections", "lock"
@@ -167,6 +169,20 @@ class RunFolder:
         if record.section_id != section_id:
             raise MalformedSection.differing(path, "section_id", expected=section_id, found=record.section_id)
         return record
+
+    def repack_sections(self, codec: SectionCodec, grid: DenseGrid | None = None) -> None:
+        """Bring every section's file into ``codec``, one after another, each replaced as a whole.
+
+        Args:
+            codec: The codec; files that have it stay as they are.
+            grid: What ``dense`` rounds to; None for the usual grid.
+
+        Raises:
+            StorageError: A section cannot be read or written; it and those after it are as they were.
+        """
+        self._require_writable()
+        for section_id in self.section_ids():
+            repack_section(self.section_path(section_id), codec, grid)
 
     def _require_writable(self) -> None:
         if self._lock is None:

@@ -1,11 +1,10 @@
-"""Named arrays and a header in one checked file: the `.vts` container, version 1 (docs/format-section.md)."""
+"""Named arrays and a header in one checked file: the `.vts` container (docs/format-section.md)."""
 
 import hashlib
 import os
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import FileIO
+from io import BytesIO, FileIO
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any
@@ -15,6 +14,8 @@ import numpy.typing as npt
 
 from vtslam.common import plain_msgpack
 from vtslam.storage.atomic import replace_file
+from vtslam.storage.column_codecs import ColumnCodec, decode_column
+from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import (
     BadMagic,
     ChecksumMismatch,
@@ -23,20 +24,18 @@ from vtslam.storage.errors import (
     UnreadableFile,
     UnsupportedVersion,
 )
+from vtslam.storage.section_codecs import SectionCodec, codec_of_header, decoded_record, encoded_record
+from vtslam.storage.section_encoding import encoded_columns
 from vtslam.storage.section_layout import (
     CRC,
     DTYPES,
     END_MARK,
     FOOTER,
-    FORMAT_VERSION,
     INDEX_REFERENCE,
     MAGIC,
-    MAX_COLUMNS,
-    MAX_DIMENSIONS,
-    NAME,
     PRELUDE,
+    READABLE_VERSIONS,
     Entry,
-    aligned,
     check_crc,
     check_equal,
     check_places,
@@ -46,6 +45,7 @@ from vtslam.storage.section_layout import (
 from vtslam.storage.section_record import SectionRecord
 
 AnyArray = npt.NDArray[Any]
+Source = FileIO | BytesIO
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,13 +62,19 @@ class _Layout:
     sha256: bytes
 
 
-def write_columns(path: Path, header: Mapping[str, Any], columns: Mapping[str, AnyArray]) -> None:
+def write_columns(
+    path: Path,
+    header: Mapping[str, Any],
+    columns: Mapping[str, AnyArray],
+    codecs: Mapping[str, ColumnCodec] | None = None,
+) -> None:
     """Write ``header`` and ``columns`` to ``path``, replacing it as a whole, then read back from disk and compare.
 
     Args:
         path: The file; its folder must exist.
         header: Plain values (see :mod:`vtslam.common.plain_msgpack`), at most 65536 bytes packed.
         columns: Arrays of integer or float32/float64 type, at most 8 dimensions; names as in the format's section 1.
+        codecs: How to store columns, by name; those not named as they are.
 
     Raises:
         MalformedSection: The format cannot hold this header or these columns.
@@ -76,86 +82,18 @@ def write_columns(path: Path, header: Mapping[str, Any], columns: Mapping[str, A
         StorageError: What came back from the disk is not what was written.
     """
     try:
-        pieces = list(_encoded(dict(header), columns))
+        pieces = encoded_columns(header, columns, codecs)
     except ValueError as error:
         raise MalformedSection(f"{path}: cannot be written: {error}") from error
+    _write_pieces(path, pieces)
+
+
+def _write_pieces(path: Path, pieces: Sequence[bytes | memoryview]) -> None:
     replace_file(path, pieces)
     written = FOOTER.unpack(pieces[-1])[1]
     found = verify_file(path)
     if found != written:
         raise ChecksumMismatch.differing(path, "SHA-256 read back", expected=written.hex(), found=found.hex())
-
-
-def _encoded(header: dict[str, Any], columns: Mapping[str, AnyArray]) -> Iterator[bytes | memoryview]:
-    """The file's bytes, piece by piece; the last piece is the footer."""
-    header_bytes = plain_msgpack.pack(header)
-    arrays = {name: _stored(name, columns[name]) for name in sorted(columns)}
-    if len(arrays) > MAX_COLUMNS:
-        raise ValueError(f"there are {len(arrays)} columns, at most {MAX_COLUMNS} fit")
-    entries, end = [], PRELUDE.size + len(header_bytes)
-    for name, array in arrays.items():
-        offset = aligned(end)
-        end = offset + array.nbytes
-        entries.append(
-            Entry(
-                name=name,
-                dtype_name=array.dtype.name,
-                shape=array.shape,
-                offset=offset,
-                length=array.nbytes,
-                crc32=zlib.crc32(_bytes_of(array)),
-            )
-        )
-    index_bytes = plain_msgpack.pack([entry.as_list() for entry in entries])
-    index_offset = aligned(end)
-    file_size = index_offset + len(index_bytes) + FOOTER.size
-
-    digest = hashlib.sha256()
-    for piece in _body(header_bytes, file_size, entries, arrays, index_offset, index_bytes):
-        digest.update(piece)
-        yield piece
-    checked = INDEX_REFERENCE.pack(index_offset, len(index_bytes), zlib.crc32(index_bytes))
-    digest.update(checked)
-    yield FOOTER.pack(checked, digest.digest(), zlib.crc32(checked + digest.digest()), END_MARK)
-
-
-def _body(
-    header_bytes: bytes,
-    file_size: int,
-    entries: Sequence[Entry],
-    arrays: Mapping[str, AnyArray],
-    index_offset: int,
-    index_bytes: bytes,
-) -> Iterator[bytes | memoryview]:
-    """Everything before the footer."""
-    fields = (MAGIC, FORMAT_VERSION, len(header_bytes), file_size, zlib.crc32(header_bytes))
-    prelude = PRELUDE.pack(*fields, 0)[: -CRC.size]
-    yield prelude + CRC.pack(zlib.crc32(prelude))
-    yield header_bytes
-    end = PRELUDE.size + len(header_bytes)
-    for entry in entries:
-        yield bytes(entry.offset - end)
-        yield _bytes_of(arrays[entry.name])
-        end = entry.offset + entry.length
-    yield bytes(index_offset - end)
-    yield index_bytes
-
-
-def _stored(name: str, array: AnyArray) -> AnyArray:
-    """``array`` little-endian and in C order (copied only if it is not), if the format can hold it."""
-    if not NAME.fullmatch(name):
-        raise ValueError(f"a column's name must match {NAME.pattern}, got {name!r:.80}")
-    dtype = DTYPES.get(array.dtype.name)
-    if dtype is None or array.ndim > MAX_DIMENSIONS:
-        raise ValueError(
-            f"column {name!r} must be one of {', '.join(DTYPES)} with at most {MAX_DIMENSIONS} dimensions, "
-            f"got {array.dtype} {array.shape}"
-        )
-    return np.asarray(array, dtype=dtype, order="C")
-
-
-def _bytes_of(array: AnyArray) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data
 
 
 def read_columns(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, Any], dict[str, AnyArray]]:
@@ -169,24 +107,26 @@ def read_columns(path: Path, names: Sequence[str] | None = None) -> tuple[dict[s
         The header, and new writable arrays by name (all, sorted by name, or as in ``names``).
 
     Raises:
-        StorageError: One of the kinds in the format's section 4.
+        StorageError: One of the kinds in the format's section 7.
     """
     with _open(path) as file:
         layout = _read_layout(file, path)
         if names is None:
-            return layout.header, dict(_read_whole(file, path, layout))
+            return layout.header, dict(_decoded(path, item) for item in _read_whole(file, path, layout))
         by_name = {entry.name: entry for entry in layout.entries}
         for name in names:
             if name not in by_name:
                 raise MalformedSection.differing(path, "columns", expected=repr(name), found=sorted(by_name))
-        return layout.header, {name: _read_column(file, path, by_name[name]) for name in names}
+        return layout.header, dict(
+            _decoded(path, (by_name[name], _read_chunk(file, path, by_name[name]))) for name in names
+        )
 
 
 def verify_file(path: Path) -> bytes:
     """Check every byte of a file, read from disk and not from memory where the system allows; its SHA-256.
 
     Raises:
-        StorageError: One of the kinds in the format's section 4.
+        StorageError: One of the kinds in the format's section 7.
     """
     with _open(path) as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -208,10 +148,10 @@ def _open(path: Path) -> FileIO:
     return FileIO(descriptor, "rb")
 
 
-def _read_layout(file: FileIO, path: Path) -> _Layout:
-    """Everything but the columns, in the order of checks of the format's section 4."""
-    size = os.fstat(file.fileno()).st_size
-    prelude, header_length, header_crc = _read_prelude(file, path, size)
+def _read_layout(file: Source, path: Path) -> _Layout:
+    """Everything but the columns, in the order of checks of the format's section 7."""
+    size = file.seek(0, os.SEEK_END)
+    prelude, version, header_length, header_crc = _read_prelude(file, path, size)
     footer = _read(file, path, size - FOOTER.size, FOOTER.size)
     reference, sha256, footer_crc, end_mark = FOOTER.unpack(footer)
     check_crc(path, "footer", footer_crc, reference + sha256)
@@ -227,7 +167,7 @@ def _read_layout(file: FileIO, path: Path) -> _Layout:
         )
     index_bytes = _read(file, path, index_offset, index_length)
     check_crc(path, "index", index_crc, index_bytes)
-    entries = parse_index(path, index_bytes)
+    entries = parse_index(path, index_bytes, version)
     check_places(path, entries, header_end, index_offset)
     header_bytes = _read(file, path, PRELUDE.size, header_length)
     check_crc(path, "header", header_crc, header_bytes)
@@ -243,8 +183,8 @@ def _read_layout(file: FileIO, path: Path) -> _Layout:
     )
 
 
-def _read_prelude(file: FileIO, path: Path, size: int) -> tuple[bytes, int, int]:
-    """The checked prelude, the header's length and its CRC."""
+def _read_prelude(file: Source, path: Path, size: int) -> tuple[bytes, int, int, int]:
+    """The checked prelude, the version, the header's length and its CRC."""
     start = _read(file, path, 0, min(size, PRELUDE.size))
     check_equal(path, "magic", MAGIC[: max(len(start), 1)], start[: len(MAGIC)], BadMagic)
     if size < PRELUDE.size + FOOTER.size:
@@ -253,51 +193,63 @@ def _read_prelude(file: FileIO, path: Path, size: int) -> tuple[bytes, int, int]
         )
     _, version, header_length, file_size, header_crc, crc = PRELUDE.unpack(start)
     check_crc(path, "prelude", crc, start[: -CRC.size])
-    check_equal(path, "format version", FORMAT_VERSION, version, UnsupportedVersion)
+    if version not in READABLE_VERSIONS:
+        raise UnsupportedVersion.differing(
+            path, "format version", expected=f"one of {', '.join(map(str, READABLE_VERSIONS))}", found=version
+        )
     check_equal(path, "size in bytes", file_size, size, TruncatedFile)
     room = min(plain_msgpack.MAX_BYTES, size - PRELUDE.size - FOOTER.size)
     if header_length > room:
         raise MalformedSection.differing(path, "header length", expected=f"at most {room}", found=header_length)
-    return start, header_length, header_crc
+    return start, version, header_length, header_crc
 
 
-def _read_whole(file: FileIO, path: Path, layout: _Layout) -> Iterator[tuple[str, AnyArray]]:
-    """Every column; at the end the SHA-256 is checked, so only an exhausted iterator vouches for the file."""
+def _read_whole(file: Source, path: Path, layout: _Layout) -> Iterator[tuple[Entry, npt.NDArray[np.uint8]]]:
+    """Every column's bytes; at the end the SHA-256 is checked, so only an exhausted iterator vouches for the file."""
     digest = hashlib.sha256(layout.prelude + layout.header_bytes)
     end = PRELUDE.size + len(layout.header_bytes)
     for entry in layout.entries:
         digest.update(_read_gap(file, path, end, entry.offset))
-        array = _read_column(file, path, entry)
-        digest.update(_bytes_of(array))
+        chunk = _read_chunk(file, path, entry)
+        digest.update(chunk.data)
         end = entry.offset + entry.length
-        yield entry.name, array
+        yield entry, chunk
     digest.update(_read_gap(file, path, end, layout.index_offset))
     digest.update(layout.index_bytes + layout.index_reference)
     if digest.digest() != layout.sha256:
         raise ChecksumMismatch.differing(path, "SHA-256", expected=layout.sha256.hex(), found=digest.hexdigest())
 
 
-def _read_column(file: FileIO, path: Path, entry: Entry) -> AnyArray:
-    array = np.empty(entry.shape, DTYPES[entry.dtype_name])
-    _fill(file, path, entry.offset, _bytes_of(array))
-    check_crc(path, f"column {entry.name!r}", entry.crc32, _bytes_of(array))
-    return array
+def _read_chunk(file: Source, path: Path, entry: Entry) -> npt.NDArray[np.uint8]:
+    chunk = np.empty(entry.length, np.uint8)
+    _fill(file, path, entry.offset, chunk.data)
+    check_crc(path, f"column {entry.name!r}", entry.crc32, chunk.data)
+    return chunk
 
 
-def _read_gap(file: FileIO, path: Path, start: int, end: int) -> bytes:
+def _decoded(path: Path, item: tuple[Entry, npt.NDArray[np.uint8]]) -> tuple[str, AnyArray]:
+    """A column's name and array."""
+    entry, chunk = item
+    try:
+        return entry.name, decode_column(chunk, entry.codec, DTYPES[entry.dtype_name], entry.shape)
+    except ValueError as error:
+        raise MalformedSection(f"{path}: column {entry.name!r}: {error}") from error
+
+
+def _read_gap(file: Source, path: Path, start: int, end: int) -> bytes:
     gap = _read(file, path, start, end - start)
     check_equal(path, f"gap at {start}", bytes(len(gap)), gap, MalformedSection)
     return gap
 
 
-def _read(file: FileIO, path: Path, offset: int, length: int) -> bytes:
+def _read(file: Source, path: Path, offset: int, length: int) -> bytes:
     """``length`` bytes, a number the caller has bounded."""
     data = bytearray(length)
     _fill(file, path, offset, memoryview(data))
     return bytes(data)
 
 
-def _fill(file: FileIO, path: Path, offset: int, target: memoryview) -> None:
+def _fill(file: Source, path: Path, offset: int, target: memoryview) -> None:
     """Read from ``offset`` until ``target`` is full; one read may give less than asked."""
     done = 0
     try:
@@ -316,19 +268,80 @@ def _fill(file: FileIO, path: Path, offset: int, target: memoryview) -> None:
 # --- sections --------------------------------------------------------------------------------------------------------
 
 
-def write_section(path: Path, record: SectionRecord) -> None:
-    """Write a section to ``path``; see :func:`write_columns`."""
-    write_columns(path, record.header(), record.columns())
+def write_section(
+    path: Path, record: SectionRecord, codec: SectionCodec = "lossless", grid: DenseGrid | None = None
+) -> None:
+    """Write a section to ``path``; see :func:`write_columns` and :func:`encode_section`."""
+    _write_pieces(path, _section_pieces(path, record, codec, grid))
+
+
+def encode_section(record: SectionRecord, codec: SectionCodec, *, name: Path, grid: DenseGrid | None = None) -> bytes:
+    """The bytes of a section's file.
+
+    Args:
+        record: The section.
+        codec: See :func:`vtslam.storage.section_codecs.encoded_record`.
+        name: What errors call the file.
+        grid: What ``dense`` rounds to; None for the usual grid.
+
+    Raises:
+        MalformedSection: The codec cannot hold this section.
+    """
+    return b"".join(_section_pieces(name, record, codec, grid))
+
+
+def decode_section(data: bytes, *, name: Path) -> SectionRecord:
+    """The section in a file's bytes, as :func:`read_section`."""
+    return _section_in(BytesIO(data), name)
+
+
+def column_bytes(data: bytes, *, name: Path) -> dict[str, int]:
+    """Stored bytes of each column of a file's bytes; raises StorageError."""
+    return {entry.name: entry.length for entry in _read_layout(BytesIO(data), name).entries}
 
 
 def read_section(path: Path) -> SectionRecord:
     """The section in a file, every byte and value checked.
 
     Raises:
-        StorageError: One of the kinds in the format's section 4.
+        StorageError: One of the kinds in the format's section 7.
+    """
+    with _open(path) as file:
+        return _section_in(file, path)
+
+
+def repack_section(path: Path, codec: SectionCodec, grid: DenseGrid | None = None) -> bool:
+    """Replace a section's file by one in another codec, as a whole; whether it was not in that codec already.
+
+    What ``fast`` or ``dense`` rounded stays rounded. ``grid`` is what ``dense`` rounds to, None the usual one.
+
+    Raises:
+        StorageError: It cannot be read or written, and is as it was.
     """
     header, columns = read_columns(path)
+    if codec_of_header(header) == codec:
+        return False
+    write_section(path, _record(path, header, columns), codec, grid)
+    return True
+
+
+def _section_pieces(
+    path: Path, record: SectionRecord, codec: SectionCodec, grid: DenseGrid | None = None
+) -> list[bytes | memoryview]:
     try:
-        return SectionRecord.from_parts(header, columns)
+        return encoded_columns(*encoded_record(record, codec, grid))
+    except ValueError as error:
+        raise MalformedSection(f"{path}: cannot be written: {error}") from error
+
+
+def _section_in(file: Source, path: Path) -> SectionRecord:
+    layout = _read_layout(file, path)
+    columns = dict(_decoded(path, item) for item in _read_whole(file, path, layout))
+    return _record(path, layout.header, columns)
+
+
+def _record(path: Path, header: Mapping[str, Any], columns: Mapping[str, AnyArray]) -> SectionRecord:
+    try:
+        return decoded_record(header, columns)
     except ValueError as error:
         raise MalformedSection(f"{path}: {error}") from error

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from vtslam.common import plain_msgpack
+from vtslam.storage.column_codecs import CODECS, RAW, most_decoded_bytes
 from vtslam.storage.errors import ChecksumMismatch, MalformedSection, StorageError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # what is written
+READABLE_VERSIONS = (1, 2)
 
 MAGIC = b"\x89VTS\r\n\x1a\n"
 END_MARK = b"VTS-END\n"
@@ -23,7 +25,6 @@ INDEX_REFERENCE = struct.Struct("<QII")  # index offset, index length, index CRC
 FOOTER = struct.Struct("<16s32sI8s")  # index reference, SHA-256, CRC of both, end mark
 CRC = struct.Struct("<I")
 _ALIGNMENT = 64
-CODEC = "raw"
 MAX_COLUMNS = 256
 MAX_DIMENSIONS = 8
 _MAX_ELEMENTS = 2**48  # with every size taken as at least 1, so that numpy can hold the shape of an empty array
@@ -36,18 +37,19 @@ DTYPES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """One row of the index: a column's name, type, shape, place (bytes) and checksum."""
+    """One row of the index: a column's name, type, shape, place (bytes), codec and checksum of the stored bytes."""
 
     name: str
     dtype_name: str
     shape: tuple[int, ...]
     offset: int
     length: int
+    codec: str
     crc32: int
 
     def as_list(self) -> list[object]:
         """The row as the index stores it."""
-        return [self.name, self.dtype_name, list(self.shape), self.offset, self.length, CODEC, self.crc32]
+        return [self.name, self.dtype_name, list(self.shape), self.offset, self.length, self.codec, self.crc32]
 
 
 def aligned(offset: int) -> int:
@@ -66,13 +68,13 @@ def parse_header(path: Path, data: bytes) -> dict[str, Any]:
     return header
 
 
-def parse_index(path: Path, data: bytes) -> tuple[Entry, ...]:
+def parse_index(path: Path, data: bytes, version: int) -> tuple[Entry, ...]:
     """The index's rows, each one consistent in itself; raises MalformedSection."""
     try:
         rows = plain_msgpack.unpack(data)
         if not isinstance(rows, list) or len(rows) > MAX_COLUMNS:
             raise ValueError(f"expected a list of at most {MAX_COLUMNS} columns, found {rows!r:.60}")
-        entries = tuple(_parse_entry(row) for row in rows)
+        entries = tuple(_parse_entry(row, CODECS if version > 1 else (RAW,)) for row in rows)
     except ValueError as error:
         raise MalformedSection(f"{path}: index: {error}") from error
     names = [entry.name for entry in entries]
@@ -81,7 +83,7 @@ def parse_index(path: Path, data: bytes) -> tuple[Entry, ...]:
     return entries
 
 
-def _parse_entry(row: Any) -> Entry:  # noqa: ANN401
+def _parse_entry(row: Any, codecs: Sequence[str]) -> Entry:  # noqa: ANN401
     """One checked row of the index; ValueError says what is wrong with it."""
     match row:
         case [str(name), str(dtype_name), list(shape), int(offset), int(length), str(codec), int(crc32)] if (
@@ -90,18 +92,20 @@ def _parse_entry(row: Any) -> Entry:  # noqa: ANN401
             pass
         case _:
             raise ValueError(f"expected [name, dtype, shape, offset, length, codec, crc32], found {row!r:.80}")
-    if not NAME.fullmatch(name) or dtype_name not in DTYPES or codec != CODEC:
+    if not NAME.fullmatch(name) or dtype_name not in DTYPES or codec not in codecs:
         raise ValueError(
-            f"expected a name like {NAME.pattern}, a dtype of {', '.join(DTYPES)} and codec {CODEC!r}, "
+            f"expected a name like {NAME.pattern}, a dtype of {', '.join(DTYPES)} and a codec of {', '.join(codecs)}, "
             f"found {name!r:.80}, {dtype_name!r:.20}, {codec!r:.20}"
         )
     sizes_known = len(shape) <= MAX_DIMENSIONS and all(type(size) is int and size >= 0 for size in shape)
     if not sizes_known or math.prod(max(size, 1) for size in shape) > _MAX_ELEMENTS:
         raise ValueError(f"column {name!r}: expected at most {MAX_DIMENSIONS} sizes, found {shape!r:.80}")
-    expected_length = math.prod(shape) * DTYPES[dtype_name].itemsize
-    if length != expected_length:
-        raise ValueError(f"column {name!r}: expected {expected_length} bytes for {dtype_name} {shape}, found {length}")
-    return Entry(name=name, dtype_name=dtype_name, shape=tuple(shape), offset=offset, length=length, crc32=crc32)
+    size = math.prod(shape) * DTYPES[dtype_name].itemsize
+    if length < 0 or (length != size if codec == RAW else size > most_decoded_bytes(codec, length)):
+        raise ValueError(f"column {name!r}: {dtype_name} {shape} takes {size} bytes, which {length} of {codec} are not")
+    return Entry(
+        name=name, dtype_name=dtype_name, shape=tuple(shape), offset=offset, length=length, codec=codec, crc32=crc32
+    )
 
 
 def check_places(path: Path, entries: Sequence[Entry], header_end: int, index_offset: int) -> None:

@@ -130,8 +130,7 @@ class SectionRecord:
         Raises:
             ValueError: A key or column is missing, unknown, or breaks a rule of the class.
         """
-        _check_map("header", header, _HEADER_TYPES)
-        _check_map("camera", header["camera"], _CAMERA_TYPES)
+        check_header_types(header)
         if header["kind"] != _KIND:
             raise ValueError(f"kind: expected {_KIND!r}, found {header['kind']!r}")
         if set(columns) != set(cls.COLUMN_TYPES):
@@ -201,6 +200,12 @@ class SectionRecord:
         values = getattr(self, name)
         if values.size and not (low <= values.min() and values.max() <= high):
             raise ValueError(f"{name}: expected {low} to {high}, found {values.min()} to {values.max()}")
+
+
+def check_header_types(header: Mapping[str, Any]) -> None:
+    """Raise ValueError unless a :meth:`SectionRecord.header` has its keys, of their types."""
+    _check_map("header", header, _HEADER_TYPES)
+    _check_map("camera", header["camera"], _CAMERA_TYPES)
 
 
 def _is_rigid(pose: npt.NDArray[np.float64]) -> bool:

@@ -142,6 +142,10 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
     basin = kinds.add_parser("basin", help="how far off a first guess of the pose may be, for both optimisers")
     basin.add_argument("--trials", type=int, default=30, metavar="N", help="guesses per error (default: %(default)s)")
+    codec = kinds.add_parser("codec", help="sections stored in each codec: bytes, quality lost, speed")
+    codec.add_argument("--source", required=True, metavar="SOURCE", help=SOURCE_HELP)
+    codec.add_argument("--curves", action="store_true", help="also coarser and finer grids of the dense codec")
+    codec.add_argument("--picture", type=Path, metavar="FILE", help="draw the curves (with --curves), PNG or JPEG")
     fleet = kinds.add_parser("fleet", help="a run as processes, beside the same in one process; delays in realtime")
     fleet.add_argument("--rounds", type=int, default=1, metavar="N", help="runs of each kind (default: %(default)s)")
     fleet.add_argument(
@@ -165,10 +169,10 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     for kind in (track, mapping, system, basin, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
-    for kind in (track, mapping, system, basin, fleet, chaos):
+    for kind in (track, mapping, system, basin, codec, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, track, mapping, system, basin, fleet, chaos):
+    for kind in (splat, track, mapping, system, basin, codec, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from vtslam.common.config import ConfigError
 from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
 from vtslam.services.bench.chaos import bench_chaos, is_sound
+from vtslam.services.bench.codec import bench_codec, steps
+from vtslam.services.bench.codec_picture import write_codec_picture
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
 from vtslam.services.bench.fleet import PARTS, FleetBench, bench_fleet
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
@@ -35,7 +37,8 @@ def bench_command(args: Namespace) -> int:
 
 
 def _measured(args: Namespace) -> dict[str, object]:
-    return {"splat": _splat, "basin": _basin, "chaos": _chaos, "fleet": _fleet}.get(args.bench, _recording)(args)
+    own = {"splat": _splat, "basin": _basin, "codec": _codec, "chaos": _chaos, "fleet": _fleet}
+    return own.get(args.bench, _recording)(args)
 
 
 def _splat(args: Namespace) -> dict[str, object]:
@@ -53,6 +56,17 @@ def _basin(args: Namespace) -> dict[str, object]:
     plan = _plan(args)
     with Progress(2 * len(ERRORS_M_DEG) * args.trials, what="tracking", unit="guess") as progress:
         return bench_basin(plan, trials=args.trials, on_step=progress.step)
+
+
+def _codec(args: Namespace) -> dict[str, object]:
+    if args.picture is not None and not args.curves:
+        raise ConfigError("bench codec: --picture draws curves: expected --curves with it")
+    plan = _plan(args)
+    with Progress(steps(curves=args.curves), what="mapping and storing", unit="step") as progress:
+        found = bench_codec(plan, curves=args.curves, on_step=progress.step)
+    if args.picture is not None:
+        write_codec_picture(args.picture, found)
+    return found
 
 
 def _chaos(args: Namespace) -> dict[str, object]:

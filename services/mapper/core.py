@@ -66,7 +66,7 @@ class Mapper:
             surface=np.zeros((0, 6), np.float32),
         ).retied()
         view = TrainingView(frame_index=0, frame=frame, exposure=exposure)
-        optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None)
+        optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=None, views=(view,))
         bundle = HeadBundle(T_world_camera, self.settings)
         if section.gaussians.count:
             for step in range(self.settings.iterations_head):
@@ -178,7 +178,9 @@ class Mapper:
             watched: After so many steps those that showed too little in them are left out; 0 never.
             in_time: Whether there is time for another step; asked from the second one on.
         """
-        optimiser = SectionOptimiser(section, neighbours, self.engine, self.settings, moments=active.moments)
+        optimiser = SectionOptimiser(
+            section, neighbours, self.engine, self.settings, moments=active.moments, views=views
+        )
         if section.gaussians.count:
             for step, (index, rate) in enumerate(zip(chosen, rates, strict=True)):
                 if optimiser.good_enough() or (step and not in_time()):

@@ -1,11 +1,12 @@
 """Optimisation of one section's attributes on its own views and, with its neighbours, on its head (Eq. 2)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.common.gaussians import first_log_radii
+from vtslam.common.gaussians import ViewTiedGaussians, first_log_radii
 from vtslam.common.geometry import se3
 from vtslam.common.optim.adam import Adam
 from vtslam.common.optim.mapping_loss import mapping_loss
@@ -27,6 +28,43 @@ class Optimised:
     loss: float
     steps: int
     renders: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FirstValues:
+    """What a section's N Gaussians started as: colours float32 [N,3], log radii float32 [N], one opacity logit."""
+
+    colors: npt.NDArray[np.float32]
+    log_radii: npt.NDArray[np.float32]
+    opacity_logit: np.float32
+
+    @classmethod
+    def of(
+        cls,
+        gaussians: ViewTiedGaussians,
+        views: Sequence[TrainingView],
+        *,
+        log_radii: npt.NDArray[np.float32],
+        opacity: float,
+    ) -> "FirstValues":
+        """Colours as the views show them; ``views`` hold every frame that Gaussians are tied to."""
+        colors = np.full((gaussians.count, 3), np.nan, np.float32)
+        for view in views:
+            rows = np.flatnonzero(gaussians.frame_index == view.frame_index)
+            observed = view.exposure.removed(view.frame.rgb).reshape(-1, 3)
+            colors[rows] = observed[gaussians.pixel[rows]]
+        if np.isnan(colors).any():
+            raise ValueError("expected the views of all frames that Gaussians are tied to")
+        return cls(colors=colors, log_radii=log_radii, opacity_logit=np.float32(np.log(opacity / (1.0 - opacity))))
+
+    def thinned(self, kept: npt.NDArray[np.bool_]) -> "FirstValues":
+        """Without those of the last Gaussians that are not ``kept`` (bool [M])."""
+        return replace(self, colors=thinned(self.colors, kept), log_radii=thinned(self.log_radii, kept))
+
+
+def _shrink(values: npt.NDArray[np.float32], towards: npt.NDArray[np.float32] | np.float32, by: float) -> None:
+    """Move values by ``by`` towards others, and no further."""
+    values += np.clip(towards - values, np.float32(-by), np.float32(by))
 
 
 def _moments_of(shape: tuple[int, ...], rate: float, settings: MapperSettings, previous: Adam | None) -> Adam:
@@ -62,6 +100,7 @@ class SectionOptimiser:
         settings: MapperSettings,
         *,
         moments: Moments | None,
+        views: Sequence[TrainingView] = (),
     ) -> None:
         self._section, self._neighbours, self._engine, self._settings = section, neighbours, engine, settings
         self._moments = _new_moments(section, settings, moments)
@@ -80,6 +119,9 @@ class SectionOptimiser:
         span = np.float32(np.log(max(settings.radius_limit, 1.0)))
         self._log_radius_bounds = (first - span, first + span)
         self._most_weight = np.zeros(g.count, np.float32)
+        self._prior: FirstValues | None = None
+        if settings.rate_weight > 0:
+            self._prior = FirstValues.of(g, views, log_radii=first, opacity=settings.initial_opacity)
 
     def step(
         self,
@@ -146,8 +188,17 @@ class SectionOptimiser:
         self._moments.colors.step(self._colors, colors, rate=rate)
         self._moments.log_radii.step(self._log_radii, log_radii, rate=rate)
         self._moments.opacity_logits.step(self._opacity_logits, opacity_logits, rate=rate)
+        if self._prior is not None:
+            self._pull(self._prior, self._settings.rate_weight * rate)
         if self._settings.radius_limit > 0:
             np.clip(self._log_radii, *self._log_radius_bounds, out=self._log_radii)
+
+    def _pull(self, prior: FirstValues, share: float) -> None:
+        """Attributes nearer to their first values by ``share`` of a step, those within it onto them (an L1 term)."""
+        s = self._settings
+        _shrink(self._colors, prior.colors, share * s.learning_rate_color)
+        _shrink(self._log_radii, prior.log_radii, share * s.learning_rate_log_radius)
+        _shrink(self._opacity_logits, prior.opacity_logit, share * s.learning_rate_opacity)
 
     def _thin(self, kept: npt.NDArray[np.bool_]) -> None:
         """Leave out those of the last Gaussians that are not ``kept`` (bool [M])."""
@@ -159,6 +210,7 @@ class SectionOptimiser:
         low, high = self._log_radius_bounds
         self._log_radius_bounds = (thinned(low, kept), thinned(high, kept))
         self._most_weight = thinned(self._most_weight, kept)
+        self._prior = None if self._prior is None else self._prior.thinned(kept)
         for moments in (self._moments.colors, self._moments.log_radii, self._moments.opacity_logits):
             moments.thin(kept)
 

@@ -1,4 +1,4 @@
-"""Small section records for tests, the same on every machine (no trigonometry, no random floats of a library)."""
+"""Small section records for tests; that of `small_section` is the same on every machine, to the bit."""
 
 import numpy as np
 
@@ -36,6 +36,53 @@ def small_section(*, section_id: int = 7, num_gaussians: int = 20, num_views: in
         opacity_logit=(rows / 8.0 - 1.0).astype(np.float32),
         view_index=np.arange(num_views, dtype=np.uint16),
         view_depth=(np.arange(num_views * HEIGHT * WIDTH) * 37).reshape(-1, HEIGHT, WIDTH).astype(np.uint16),
+    )
+
+
+def surface_section(*, frames: int = 4, width: int = 24, height: int = 16, seed: int = 3) -> SectionRecord:
+    """A section of a smooth textured surface with edges, holes and noise, in the order that the mapper keeps."""
+    random = np.random.Generator(np.random.Philox(seed))
+    row, column = np.mgrid[:height, :width]
+    parts = []
+    for frame in range(frames):
+        depth = (4000 + 9 * row + 5 * column + 40 * frame + random.integers(0, 3, (height, width))).astype(np.uint16)
+        depth[(row + column + frame) % 11 == 0] = 0
+        mask = (depth > 0) & ((frame == 0) | (random.random((height, width)) < 0.2))
+        whole = np.flatnonzero(mask)
+        edge = np.flatnonzero(mask & (column % 8 == 0))
+        pixel = np.concatenate([whole, np.repeat(edge, 4)])
+        subpixel = np.concatenate([np.zeros(whole.size, np.uint8), np.tile(np.arange(1, 5, dtype=np.uint8), edge.size)])
+        kept = random.random(pixel.size) < 0.8
+        parts.append((np.full(pixel.size, frame)[kept], pixel[kept], subpixel[kept], depth.reshape(-1)[pixel[kept]]))
+    frame_index, pixel, subpixel, depth = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    count = pixel.size
+    shade = 0.5 + 0.01 * (pixel % width) + 0.1 * (pixel // width % 2)
+    width_m = depth * 0.001 / (0.9 * width) * np.where(subpixel > 0, 0.5, 1.0)
+    view = np.zeros((2, height, width), np.uint16)
+    view[0].reshape(-1)[pixel[frame_index == 0]] = depth[frame_index == 0]
+    view[1].reshape(-1)[pixel[frame_index == 2]] = depth[frame_index == 2]
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(frames)
+    return SectionRecord(
+        section_id=5,
+        camera=Camera(width=width, height=height, fx=0.9 * width, fy=0.9 * width, cx=0.5 * width, cy=0.5 * height),
+        depth_scale_m=0.001,
+        depth_factor=1.0,
+        T_world_section=np.eye(4),
+        frame_ids=np.arange(frames, dtype=np.int64),
+        capture_times_ns=33_000_000 * np.arange(frames, dtype=np.int64),
+        T_section_frame=poses,
+        exposure_gain=np.ones((frames, 3), np.float32),
+        exposure_offset=np.zeros((frames, 3), np.float32),
+        frame_index=frame_index.astype(np.uint16),
+        pixel=pixel.astype(np.int32),
+        subpixel=subpixel.astype(np.uint8),
+        depth=depth.astype(np.uint16),
+        color=(shade[:, None] * [1.0, 0.8, 0.6] + random.normal(0, 0.02, (count, 3))).astype(np.float32),
+        log_radius=(np.log(0.55 * width_m) + random.normal(0, 0.2, count)).astype(np.float32),
+        opacity_logit=random.normal(2.0, 2.0, count).astype(np.float32),
+        view_index=np.array([0, 2], np.uint16),
+        view_depth=view,
     )
 
 

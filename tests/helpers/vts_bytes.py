@@ -24,7 +24,7 @@ class VtsParts:
     header: bytes
     body: bytes
     index: bytes
-    version: int = 1
+    version: int = 2
     header_length: int | None = None
     file_size: int | None = None
     index_offset: int | None = None
@@ -64,6 +64,17 @@ class VtsParts:
         body = self.body[:start] + data + self.body[start + len(data) :]
         # A checksum's shortest msgpack form may differ in length; that only moves the end of the file.
         return replace(self, body=body, index=msgpack.packb(rows))
+
+    def with_chunk(self, name: str, data: bytes) -> "VtsParts":
+        """The same with a column's stored bytes replaced, of any length; lengths, places and checksums made right."""
+        rows, body, end = self.rows, b"", PRELUDE_BYTES + len(self.header)
+        for row in rows:
+            start = row[3] - PRELUDE_BYTES - len(self.header)
+            chunk = data if row[0] == name else self.body[start : start + row[4]]
+            body += bytes(-end % 64) + chunk
+            row[3], row[4], row[6] = end + -end % 64, len(chunk), zlib.crc32(chunk)
+            end = row[3] + row[4]
+        return replace(self, body=body + bytes(-end % 64), index=msgpack.packb(rows))
 
     def sealed(self) -> bytes:
         """The file, with every checksum right."""

@@ -127,3 +127,24 @@ def test_a_fleet_under_fire_loses_nothing(small: SmallRecording) -> None:
     assert is_sound(values)
     assert values["kills"] >= 3  # the sensor may have finished before its turn
     assert values["kills_in_shm_write"] >= 1
+
+
+def test_codec_reports_bytes_quality_and_speed(tmp_path: Path) -> None:
+    source = ["--source", "sim:room?frames=8", "--size", "64x48", "--set", "section.length=4", "--holdout", "3"]
+    picture = tmp_path / "codec.png"
+    values = bench("codec", *source, "--curves", "--picture", str(picture), result=tmp_path / "codec.json")
+    assert picture.stat().st_size > 1000
+    sizes = [values[codec]["bytes_per_gaussian"] for codec in ("lossless", "fast", "dense")]
+    assert sizes == sorted(sizes, reverse=True)
+    assert values["lossless"]["exact"]
+    assert values["lossless"]["psnr_loss_db"] == values["lossless"]["heldout_loss_db"] == 0.0
+    for codec in ("lossless", "fast", "dense", "dense_rate"):
+        assert values[codec]["encode_mb_s"] > 0
+        assert values[codec]["decode_mb_s"] > 0
+        assert values[codec]["file_bytes_per_gaussian"] > values[codec]["bytes_per_gaussian"]
+    curve = values["curves"]["dense"]
+    assert [point["bytes_per_gaussian"] for point in curve] == sorted(
+        (point["bytes_per_gaussian"] for point in curve), reverse=True
+    )
+    assert curve[0]["psnr_heldout_db"] > curve[-1]["psnr_heldout_db"]
+    assert curve[1]["bytes_per_gaussian"] == values["dense"]["bytes_per_gaussian"]

@@ -194,3 +194,16 @@ def test_eval_refuses_a_recording_that_has_changed(tmp_path: Path, capsys: pytes
 
     assert main(["eval", str(out)]) == 1
     assert "expected the 3 frames of 48x36 that the run was made from, found 2" in capsys.readouterr().err
+
+
+def test_a_dense_run_is_the_same_run_in_small_files(room_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "dense"
+    assert run_room(out, "--set", "storage.codec=dense") == 0
+    plain, dense = RunFolder.open(room_run), RunFolder.open(out)
+    # The third section is tracked against earlier ones, which the codec has not touched while the run lasted.
+    assert dense.trajectory_path.read_bytes() == plain.trajectory_path.read_bytes()
+    for section_id in plain.section_ids():
+        assert dense.read_section(section_id).pixel.tobytes() == plain.read_section(section_id).pixel.tobytes()
+        assert dense.section_path(section_id).stat().st_size < plain.section_path(section_id).stat().st_size / 2
+    loss_db = [float(str(evaluate_run(RecordedRun(path))["psnr_paper_db"])) for path in (room_run, out)]
+    assert 0 < loss_db[0] - loss_db[1] < 0.5

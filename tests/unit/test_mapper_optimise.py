@@ -203,3 +203,23 @@ def test_the_pose_gradient_is_that_of_moving_the_section_against_its_neighbours(
     assert np.linalg.norm(gradient - numeric) < 0.25 * np.linalg.norm(numeric)
     cosine = gradient @ numeric / (np.linalg.norm(gradient) * np.linalg.norm(numeric))
     assert cosine > 0.97
+
+
+def test_rate_term_keeps_attributes_at_their_first_values() -> None:
+    shares = []
+    for weight in (0.0, 0.3, 1.0):
+        section = fresh_section()
+        settings = replace(STILL, rate_weight=weight)
+        run = SectionOptimiser(section, [], NativeEngine(threads=1), settings, moments=None, views=(VIEW,))
+        for _ in range(8):
+            run.step(VIEW, with_neighbours=False)
+        found, first = run.finished().section.gaussians, section.gaussians
+        same = [np.abs(found.colors - first.colors), np.abs(found.log_radii - first.log_radii)[:, None]]
+        shares.append(float((np.concatenate(same, axis=1) < 1e-6).mean()))
+    assert shares[0] < 0.3 < shares[1] + 0.3 < shares[2] + 0.3
+    assert shares[2] > 0.9
+
+
+def test_rate_term_needs_the_frames_that_gaussians_are_tied_to() -> None:
+    with pytest.raises(ValueError, match="expected the views of all frames"):
+        optimiser(replace(SMALL_MAPPER, rate_weight=0.1), [])

@@ -36,7 +36,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def parts(path: Path) -> VtsParts:
-    write_section(path, small_section())
+    write_section(path, small_section(), "raw")
     return parts_of(path.read_bytes())
 
 
@@ -243,8 +243,8 @@ def test_kinds_of_damage(
 
 
 def test_newer_version_is_told_from_damage(path: Path, parts: VtsParts) -> None:
-    path.write_bytes(replace(parts, version=2).sealed())
-    with pytest.raises(UnsupportedVersion, match="format version: expected 1, found 2"):
+    path.write_bytes(replace(parts, version=3).sealed())
+    with pytest.raises(UnsupportedVersion, match="format version: expected one of 1, 2, found 3"):
         read_section(path)
 
 
@@ -297,18 +297,21 @@ def test_wrong_sha256_under_right_crcs(path: Path, parts: VtsParts) -> None:
         (_row("depth", 0, "../depth"), r"expected a name like .*, found '\.\./depth'"),
         (_row("depth", 0, "color"), "expected names sorted and unique"),
         (_row("depth", 1, "object"), "found 'depth', 'object'"),
-        (_row("depth", 1, "uint32"), r"'depth': expected 80 bytes for uint32 \[20\], found 40"),
+        (_row("depth", 1, "uint32"), r"'depth': uint32 \[20\] takes 80 bytes, which 40 of raw are not"),
         (_row("depth", 2, [2**60]), "'depth': expected at most 8 sizes, found"),
         (_row("depth", 2, [-20]), "'depth': expected at most 8 sizes, found"),
         (_row("depth", 2, [0, 2**60]), "'depth': expected at most 8 sizes, found"),
         (_row("depth", 2, [1] * 9), "'depth': expected at most 8 sizes, found"),
-        (_row("depth", 2, [40]), r"'depth': expected 80 bytes for uint16 \[40\], found 40"),
+        (_row("depth", 2, [40]), r"'depth': uint16 \[40\] takes 80 bytes, which 40 of raw are not"),
         (_row("depth", 2, 20), r"expected \[name, dtype, shape"),
         (_row("depth", 3, 64), "offset of column 'depth': expected"),
-        (_row("depth", 4, 2**62), r"'depth': expected 40 bytes for uint16 \[20\], found"),
-        (_row("depth", 4, -1), r"'depth': expected 40 bytes for uint16 \[20\], found -1"),
+        (_row("depth", 4, 2**62), r"'depth': uint16 \[20\] takes 40 bytes, which \d+ of raw are not"),
+        (_row("depth", 4, -1), r"'depth': uint16 \[20\] takes 40 bytes, which -1 of raw are not"),
         (_row("depth", 6, True), r"expected \[name, dtype, shape"),
-        (_row("depth", 5, "lz4"), "codec 'raw', found 'depth', 'uint16', 'lz4'"),
+        (_row("depth", 5, "lz4"), "a codec of raw, .*, found 'depth', 'uint16', 'lz4'"),
+        (lambda parts: _row("depth", 5, "planes_lz4")(replace(parts, version=1)), "a codec of raw, found"),
+        (_row("depth", 5, "planes_lz4"), "column 'depth': (not an LZ4 block|expected 40 bytes in the LZ4 block)"),
+        (_row("depth", 5, "quantised_lz4"), "column 'depth': expected float32 and a grid"),
         (lambda parts: parts.with_rows(parts.rows[:-1]), "offset of the index: expected"),
         (lambda parts: parts.with_rows([*parts.rows[:-1], []]), r"expected \[name, dtype"),
         (lambda parts: parts.with_rows({"a": 1}), "expected a list of at most 256 columns"),
