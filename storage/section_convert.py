@@ -81,7 +81,13 @@ class SectionArchive:
 
     def write(self, section: Section) -> None:
         """Keep a sealed section, durable and verified; raises StorageError."""
-        self._run.write_section(record_of(section))
+        self.written(section)
+
+    def written(self, section: Section) -> SectionRecord:
+        """As :meth:`write`; what was written."""
+        record = record_of(section)
+        self._run.write_section(record)
+        return record
 
     def read(self, section_id: int) -> Section:
         """A section written before; raises StorageError."""

@@ -62,14 +62,20 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         "track and map a recording",
         example="vtslam run replica:DIR --size 320x240 --frames 0:120 --out RUN",
     )
-    command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    command.add_argument("source", nargs="?", metavar="SOURCE", help=SOURCE_HELP)
     command.add_argument(
         "--in-process",
         action="store_true",
         help="one process for all services; the result is the same",
     )
-    command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
+    command.add_argument("--out", type=Path, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    command.add_argument(
+        "--resume",
+        type=Path,
+        metavar="RUN",
+        help="go on with a run that was cut off or stopped, with its own source and settings",
+    )
     _add_layers(command)
     _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)

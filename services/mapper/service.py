@@ -18,7 +18,7 @@ from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.shm.sealed_block import sealed_bytes
 from vtslam.common.splat.engine import Engine
 from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED, TRACKER_POSE
-from vtslam.services.commit_facts import CommitFacts
+from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.frame_facts import FIRST_FRAME_STATE, CommittedFrame, Seconds, frame_facts
 from vtslam.services.frame_journal import JournalWriter
 from vtslam.services.mapper.state import ActiveSection, CommitRecord
@@ -197,6 +197,7 @@ class MapperService:
             ),
             T_world_previous=None if self._facts is None else self._facts.frame.T_world_camera,
             history=pose.history,
+            pixels_crc32=pixels_crc32(frame),
         )
 
     def _commit(self, mapped: _Mapped) -> float:
@@ -278,8 +279,9 @@ class MapperService:
 
     def _announce(self, facts: CommitFacts) -> None:
         """Tell of the last commit; harmless if that was done before."""
-        self._journal.append(facts.frame)
-        self._open_ring().acknowledge(facts.sequence)
+        self._journal.append(facts, section_ended=self._active is None)
+        if self._paths.ring.exists():  # when a run is resumed, it is made later, and made so that this holds
+            self._open_ring().acknowledge(facts.sequence)
         frame, about = facts.frame, facts.frame.facts
         self._committed.publish(
             FrameCommitted(

@@ -10,7 +10,7 @@ CREDIT = 2  # frames in the ring that are not committed: the one at work, and th
 _PINS = 4
 
 
-def make_ring(path: Path, camera: Camera) -> FrameRingWriter:
-    """A new ring for frames of ``camera``; raises SharedMemoryFull."""
+def make_ring(path: Path, camera: Camera, *, frames_before: int = 0) -> FrameRingWriter:
+    """A new ring for frames of ``camera`` after the first ``frames_before``; raises SharedMemoryFull."""
     spec = RingSpec(width=camera.width, height=camera.height, slots=_PINS + CREDIT, pins=_PINS)
-    return FrameRingWriter.create(path, spec)
+    return FrameRingWriter.create(path, spec, acknowledged=frames_before)

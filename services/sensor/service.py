@@ -22,13 +22,14 @@ class RecordingSensor:
         link: What it says of itself and is told.
         source: The recording; after a restart frames that the ring does not have are read again.
         ring_path: Where the ring is, or will be.
+        frames_before: Frames that an earlier part of the run has mapped.
     """
 
-    def __init__(self, bus: Bus, link: ServiceLink, source: Source, ring_path: Path) -> None:
+    def __init__(self, bus: Bus, link: ServiceLink, source: Source, ring_path: Path, *, frames_before: int = 0) -> None:
         self._link, self._source = link, source
         self._frames = bus.publisher(SENSOR_FRAME)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
-        self._ring = _open_ring(ring_path, source)
+        self._ring = _open_ring(ring_path, source, frames_before)
         self._next = self._ring.published  # frames are numbered from 0, the ring's sequence from 1
         self._read: tuple[Frame, float] | None = None
         self._announce_again(FrameRingReader(ring_path))
@@ -73,11 +74,11 @@ class RecordingSensor:
         )
 
 
-def _open_ring(path: Path, source: Source) -> FrameRingWriter:
+def _open_ring(path: Path, source: Source, frames_before: int) -> FrameRingWriter:
     """The fleet's ring, taken over from a sensor that died if there was one."""
     if path.exists():
         return FrameRingWriter.adopt(path)
-    return make_ring(path, source.camera)
+    return make_ring(path, source.camera, frames_before=frames_before)
 
 
 def _timed(source: Source, index: int) -> tuple[Frame, float]:

@@ -96,7 +96,9 @@ def _sensor(parts: _Parts) -> "Steps":
 
     if parts.source == LIVE_SOURCE:
         return LiveSensor(parts.bus, parts.link, parts.folder.ring_path)
-    return RecordingSensor(parts.bus, parts.link, open_source(parts.source), parts.folder.ring_path)
+    durable = parts.run.catalog.num_frames  # when the sensor starts for the first time, these are all
+    source, ring_path = open_source(parts.source), parts.folder.ring_path
+    return RecordingSensor(parts.bus, parts.link, source, ring_path, frames_before=durable)
 
 
 def _tracker(parts: _Parts) -> "Steps":

@@ -15,6 +15,7 @@ from vtslam.common.topics import Role
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.process_facts import peak_rss_mb
+from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
@@ -22,6 +23,7 @@ from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
 from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.section_convert import SectionArchive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,14 +46,22 @@ class FleetHooks:
 
 
 def run_in_fleet(
-    run: RunFolder, settings: Settings, hooks: FleetHooks, *, fleet: str = "", base: Path = SHARED_MEMORY
+    run: RunFolder,
+    settings: Settings,
+    hooks: FleetHooks,
+    *,
+    resume: ResumePoint | None = None,
+    fleet: str = "",
+    base: Path = SHARED_MEMORY,
 ) -> RunSummary:
     """Run the recording that ``run.toml`` names, each service a process of its own, in lockstep.
 
     Args:
-        run: An empty run folder, open for writing; settings and source are read from its ``run.toml``.
+        run: A run folder, open for writing, empty unless ``resume`` is given; settings and source are read from its
+            ``run.toml``.
         settings: The same settings.
         hooks: What the caller is told and asked.
+        resume: Where to go on; from the beginning if None.
         fleet: Name of the fleet; one of its own unless given.
         base: Where the fleet's shared memory lies.
 
@@ -72,6 +82,9 @@ def run_in_fleet(
             metrics.observe(facts)
             hooks.on_frame(facts)
 
+        if resume is not None:
+            section = SectionArchive(run).read(resume.section_id)
+            store.restore(section, resume.frame, resume.facts.packed())
         recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
         with Hub(folder.path, fleet) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
             supervisor = Supervisor(

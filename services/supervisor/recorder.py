@@ -1,10 +1,11 @@
-"""Writes the run folder of a fleet from its shared memory: sections, trajectory, facts per frame."""
+"""Writes the run folder of a fleet from its shared memory: sections with their frames."""
 
 import contextlib
 from collections.abc import Callable
 
-from vtslam.common.shm.errors import SectionNotResident, SectionPinned
+from vtslam.common.shm.errors import SectionPinned
 from vtslam.common.shm.map_store import MapStore
+from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.run_record import RunRecord, RunSummary
@@ -29,8 +30,9 @@ class Recorder:
     ) -> None:
         self._run, self._store, self._journal, self._on_frame = run, store, journal, on_frame
         self._record = RunRecord(run)
-        self._on_disk: set[int] = set()
-        self._frames_on_disk = self._frames_written = 0
+        self._next_section = len(run.catalog.sections())
+        journal.forget_before(self._next_section)
+        self._ended: dict[int, CommitFacts] = {}  # by section: sealed, and all its frames are known
 
     @property
     def num_frames(self) -> int:
@@ -41,9 +43,6 @@ class Recorder:
         """Take in what is new, and let sections that are on disk leave memory; raises StorageError."""
         self._take_frames()
         self._archive()
-        if self._frames_written < self._frames_on_disk <= self.num_frames:
-            self._record.write()
-            self._frames_written = self.num_frames
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
         """Write everything that is not written yet; see `RunRecord.finish`."""
@@ -51,27 +50,31 @@ class Recorder:
         return self._record.finish(finished=finished, interrupted=interrupted, seconds=seconds, peak_rss_mb=peak_rss_mb)
 
     def _take_frames(self) -> None:
-        for frame in self._journal.new_frames():
+        for line in self._journal.new_lines():
+            frame = line.frame
             is_new = frame.facts.frame_id >= self.num_frames
             self._record.add(frame)
+            if line.ended is not None:
+                self._ended[frame.facts.section_id] = line.ended
             if is_new:
                 self._on_frame(frame.facts)
 
     def _archive(self) -> None:
-        sealed = self._store.sealed_ids()
-        for section_id in sealed:
-            if section_id not in self._on_disk:
-                self._write(section_id)
-        for section_id in sealed[:-_RESIDENT_SECTIONS]:
-            with contextlib.suppress(SectionPinned):
-                self._store.unlink_sealed(section_id, verified_on_disk=True)
+        while self._next_section in self._ended:
+            self._write(self._next_section)
+            self._next_section += 1
+            self._journal.forget_before(self._next_section)
+        for section_id in self._store.sealed_ids()[:-_RESIDENT_SECTIONS]:
+            if section_id < self._next_section:
+                with contextlib.suppress(SectionPinned):
+                    self._store.unlink_sealed(section_id, verified_on_disk=True)
 
     def _write(self, section_id: int) -> None:
-        with contextlib.suppress(SectionNotResident):
-            held = self._store.pinned_sealed(section_id)
-            try:
-                self._run.write_section(record_of(held.section))
-                self._frames_on_disk += len(held.section.frames)
-            finally:
-                held.release()
-            self._on_disk.add(section_id)
+        """Make a section durable; the map store keeps it until then."""
+        held = self._store.pinned_sealed(section_id)
+        try:
+            record = record_of(held.section)
+            self._run.write_section(record)
+            self._record.commit(record, self._ended.pop(section_id))
+        finally:
+            held.release()

@@ -14,7 +14,6 @@ from vtslam.common.messages import (
     PoseState,
     ServiceState,
     TrackedPose,
-    TrackerHistory,
 )
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
@@ -118,14 +117,7 @@ class TrackerService:
         facts = self._follower.facts
         if facts is None:
             return TrackerState()
-        history = facts.history
-        return TrackerState(
-            committed_poses=facts.committed_poses,
-            previous_frame=self._follower.frame,
-            losses=tuple(zip(history.color_losses, history.depth_losses_m, strict=True)),
-            largest_mean_depths_m=history.largest_mean_depths_m,
-            exposure=facts.exposure,
-        )
+        return TrackerState.resumed(facts.committed_poses, self._follower.frame, facts.history, facts.exposure)
 
     def _publish(
         self,
@@ -153,7 +145,7 @@ class TrackerService:
                 quality=None if result is None else _quality(result),
                 state=PoseState.OK if result is None else PoseState(result.state.value),
                 overlap_section_id=-1 if result is None else result.overlap_section_id,
-                history=_history(after),
+                history=after.history(),
                 read_s=self._read_s.pop(frame.frame_id, 0.0),
                 track_s=track_s,
             )
@@ -188,14 +180,6 @@ class TrackerService:
             state=PoseState.OK if result is None else PoseState(result.state.value),
             epoch=self._link.epoch,
         )
-
-
-def _history(state: TrackerState) -> TrackerHistory:
-    return TrackerHistory(
-        color_losses=tuple(float(color) for color, _ in state.losses),
-        depth_losses_m=tuple(float(depth) for _, depth in state.losses),
-        largest_mean_depths_m=tuple(float(depth) for depth in state.largest_mean_depths_m),
-    )
 
 
 def _quality(result: TrackResult) -> PoseQuality:

@@ -170,7 +170,7 @@ class FleetWorld:
         """Let the fleet run to its end."""
         assert self.world.run(timeout_s=TIMEOUT_S), f"no end; deaths {self.world.deaths}"
         sections = [self._store.pinned_sealed(section_id).section.retied() for section_id in self._store.sealed_ids()]
-        frames = {each.facts.frame_id: each for each in JournalReader(self._folder / "journal").new_frames()}
+        frames = {line.frame.facts.frame_id: line.frame for line in JournalReader(self._folder / "journal").new_lines()}
         assert sorted(frames) == list(range(FRAMES))
         return Result(
             tuple(section_bytes(section) for section in sections),

@@ -1,0 +1,148 @@
+"""A run that was cut off goes on, and leaves the bytes of an undisturbed one."""
+
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
+from helpers.recordings import cut_in_half
+
+from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.run_plan import plan_resume
+from vtslam.services.sensor.sources.base import SourceError
+from vtslam.storage.errors import ChecksumMismatch, RunFolderError, RunLocked, UnreadableFile
+from vtslam.storage.run_folder import RunFolder
+
+
+class CutOff(Exception):
+    """Stands for the end of the process."""
+
+
+def cut_off_at(frame_id: int) -> Callable[[FrameFacts], None]:
+    def on_frame(facts: FrameFacts) -> None:
+        if facts.frame_id == frame_id:
+            raise CutOff
+
+    return on_frame
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cut_off_at_random_frames_again_and_again(seed: int, small: SmallRecording, tmp_path: Path) -> None:
+    run, rng = tmp_path / "run", Random(seed)
+    with pytest.raises(CutOff):
+        small_plan(small.files).execute(run, on_frame=cut_off_at(rng.randrange(FRAMES)))
+    for _ in range(2):
+        durable = RunFolder.open(run).catalog.num_frames
+        if durable < FRAMES:
+            with pytest.raises(CutOff):
+                plan_resume(run).resume(run, on_frame=cut_off_at(rng.randrange(durable, FRAMES)))
+        assert RunFolder.open(run).catalog.num_frames >= durable
+    seen: list[int] = []
+    summary = plan_resume(run).resume(run, on_frame=lambda facts: seen.append(facts.frame_id))
+
+    assert result_bytes(run) == small.undisturbed
+    assert seen == list(range(FRAMES - len(seen), FRAMES))
+    assert (summary.frames, summary.sections) == (FRAMES, 4)
+    with RunFolder.open(run) as folder:
+        assert folder.read_info().facts.finished
+        assert [row["frame_id"] for row in folder.read_frames()] == list(range(FRAMES))
+        kinds = [event.kind for event in folder.catalog.events()]
+    assert kinds == ["resumed"] * (len(kinds) - 1) + ["finished"]
+
+
+def test_a_run_in_one_process_goes_on_in_a_fleet(small: SmallRecording, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with pytest.raises(CutOff):
+        small_plan(small.files).execute(run, on_frame=cut_off_at(2 * SECTION + 1))
+    again = Disturbance(frames=2 * SECTION)
+    summary = plan_resume(run).resume_in_fleet(run, again.hooks())
+
+    assert result_bytes(run) == small.undisturbed
+    assert (again.frames, summary.frames, summary.sections) == (FRAMES, FRAMES, 4)
+
+
+def test_a_fleet_that_was_stopped_maps_its_short_section_again(small: SmallRecording, tmp_path: Path) -> None:
+    run, calm = tmp_path / "run", Disturbance()
+    stopped = fleet_run(small.files, run, calm, should_stop=lambda: calm.frames > SECTION)
+    assert stopped.interrupted
+    assert stopped.frames % SECTION
+    (run / "metrics.json").write_text("{}")
+    summary = plan_resume(run).resume(run)
+
+    assert result_bytes(run) == small.undisturbed
+    assert (summary.frames, summary.interrupted) == (FRAMES, False)
+    assert summary.seconds > stopped.seconds
+    assert not (run / "metrics.json").exists()
+
+
+def test_a_finished_run_is_left_as_it_is(small: SmallRecording, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    first = small_plan(small.files).execute(run)
+    again, in_fleet = plan_resume(run).resume(run), plan_resume(run).resume_in_fleet(run, Disturbance().hooks())
+
+    assert first == again == in_fleet
+    assert result_bytes(run) == small.undisturbed
+
+
+def test_a_frame_that_could_not_be_read_is_read_when_it_can_be(small: SmallRecording, tmp_path: Path) -> None:
+    run, path = tmp_path / "run", small.files.color_path(SECTION + 2)
+    whole = path.read_bytes()
+    plan = small_plan(small.files)
+    cut_in_half(path)
+    try:
+        with pytest.raises(SourceError, match=path.name):
+            plan.execute(run)
+    finally:
+        path.write_bytes(whole)
+    plan_resume(run).resume(run)
+
+    assert result_bytes(run) == small.undisturbed
+
+
+def test_another_recording_in_its_place_is_refused(small: SmallRecording, tmp_path: Path) -> None:
+    run, path, other = tmp_path / "run", small.files.color_path(SECTION - 1), small.files.color_path(0)
+    with pytest.raises(CutOff):
+        small_plan(small.files).execute(run, on_frame=cut_off_at(SECTION))
+    whole = path.read_bytes()
+    path.write_bytes(other.read_bytes())
+    try:
+        with pytest.raises(RunFolderError, match=r"frame 5 of replica:.* is not the one that was mapped"):
+            plan_resume(run).resume(run)
+    finally:
+        path.write_bytes(whole)
+
+
+def test_two_fleets_on_one_run_folder_are_refused(small: SmallRecording, tmp_path: Path) -> None:
+    run, told = tmp_path / "run", []
+
+    def try_another(facts: FrameFacts) -> None:
+        if facts.frame_id == SECTION:
+            with pytest.raises(RunLocked, match="another process is writing this run"):
+                plan_resume(run).resume_in_fleet(run, Disturbance().hooks())
+            with pytest.raises(RunLocked, match="another process is writing this run"):
+                small_plan(small.files).execute(run, overwrite=True)
+            told.append(facts.frame_id)
+
+    small_plan(small.files).execute(run, on_frame=try_another)
+    assert told == [SECTION]
+    assert result_bytes(run) == small.undisturbed
+
+
+@pytest.mark.parametrize("harm", ["cut", "deleted", "swapped"])
+def test_damaged_sections_are_named_before_anything_is_mapped(harm: str, small: SmallRecording, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with pytest.raises(CutOff):
+        small_plan(small.files).execute(run, on_frame=cut_off_at(2 * SECTION))
+    first, second = run / "sections" / "000000.vts", run / "sections" / "000001.vts"
+    kept = second.read_bytes()
+    if harm == "cut":
+        cut_in_half(first)
+    elif harm == "deleted":
+        first.unlink()
+    else:
+        first.write_bytes(kept)
+    with pytest.raises((ChecksumMismatch, UnreadableFile), match=r"000000\.vts: .*(expected|cannot open)"):
+        plan_resume(run).resume(run)
+    assert second.read_bytes() == kept
+    assert RunFolder.open(run).catalog.num_frames == 2 * SECTION
