@@ -19,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.geometry.camera import Camera
+from vtslam.common.overlap.coarse import CoarseDepth
+from vtslam.common.overlap.view_index import ViewFacts
 from vtslam.storage.catalog_rows import (
     MISSING,
     Event,
@@ -26,7 +28,6 @@ from vtslam.storage.catalog_rows import (
     Pose,
     SectionRow,
     Totals,
-    ViewRow,
     packed_facts,
     packed_pose,
     packed_views,
@@ -49,7 +50,7 @@ JOIN anchors a ON a.section_id = f.section_id
   AND a.version = (SELECT max(version) FROM anchors WHERE section_id = f.section_id)
 ORDER BY f.frame_id"""
 _VIEWS = """
-SELECT f.section_id, f.section_row, f.frame_id, v.nearest, v.farthest, a.T_world_section, p.T_section_frame
+SELECT f.section_id, f.section_row, f.frame_id, v.farthest, a.T_world_section, p.T_section_frame
 FROM frames f
 JOIN views v ON v.frame_id = f.frame_id
 JOIN poses p ON p.frame_id = f.frame_id
@@ -70,8 +71,8 @@ class Catalog:
         path: The file.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        self.path, self._connection = path, connection
+    def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
+        self.path, self._connection, self._writable = path, connection, writable
 
     @classmethod
     def create(cls, path: Path) -> Self:
@@ -111,11 +112,20 @@ class Catalog:
         except BaseException:
             connection.close()
             raise
-        return cls(path, connection)
+        return cls(path, connection, writable=mode != "ro")
 
     def close(self) -> None:
-        """Give the file back."""
+        """Give the file back; a writer leaves all in that one file."""
+        if self._writable:
+            with contextlib.suppress(sqlite3.Error):  # a full disk: what is in the log counts as well
+                self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         self._connection.close()
+
+    def check(self) -> None:
+        """Look at every page; raises CatalogError if the file is damaged."""
+        (found,) = self._rows("PRAGMA integrity_check(1)")[0]
+        if found != "ok":
+            raise CatalogError(f"{self.path}: expected a whole catalogue, found {found}")
 
     # --- sections and their frames ----------------------------------------------------------------------------------
 
@@ -156,7 +166,7 @@ class Catalog:
                 T_section = packed_pose(record.T_section_frame[index])
                 db.execute("INSERT INTO poses VALUES (?,0,?)", (frame.frame_id, T_section))
                 db.execute("INSERT INTO quality VALUES (?,?)", (frame.frame_id, facts[index]))
-            db.executemany("INSERT INTO views VALUES (?,?,?,?)", packed_views(record))
+            db.executemany("INSERT INTO views VALUES (?,?,?)", packed_views(record))
 
     def sections(self) -> list[SectionRow]:
         """All sections, in order."""
@@ -251,27 +261,33 @@ class Catalog:
 
     # --- candidate views --------------------------------------------------------------------------------------------
 
-    def views(self, first_section_id: int, end_section_id: int) -> Iterator[ViewRow]:
+    def views(self, first_section_id: int, end_section_id: int) -> Iterator[ViewFacts]:
         """The candidate views of a range of sections, in order."""
         of_section = {row.section_id: row for row in self.sections()}
-        for section_id, section_row, frame_id, near, far, anchor, pose in self._each(
+        for section_id, section_row, frame_id, farthest, anchor, pose in self._each(
             _VIEWS, first_section_id, end_section_id
         ):
-            yield ViewRow(
+            yield ViewFacts(
                 section_id=section_id,
                 section_row=section_row,
                 frame_id=frame_id,
                 T_world_camera=unpacked_pose(anchor) @ unpacked_pose(pose),
-                nearest=near,
-                farthest=far,
+                farthest=farthest,
                 camera=of_section[section_id].camera,
                 depth_scale_m=of_section[section_id].depth_scale_m,
             )
 
-    def coarse_depth(self, frame_id: int) -> bytes | None:
-        """The coarse depth of a candidate view as `CoarseDepth.packed`; None if it is not one on disk."""
-        rows = self._rows("SELECT coarse FROM views WHERE frame_id = ?", frame_id)
-        return rows[0][0] if rows else None
+    def coarse_depth(self, frame_id: int) -> CoarseDepth | None:
+        """The coarse depth of a candidate view; None if it is not one on disk."""
+        rows = self._rows(
+            "SELECT v.coarse, s.camera FROM views v JOIN frames f USING (frame_id) JOIN sections s USING (section_id) "
+            "WHERE v.frame_id = ?",
+            frame_id,
+        )
+        if not rows:
+            return None
+        camera = json.loads(rows[0][1])
+        return CoarseDepth.unpacked(rows[0][0], width=camera["width"], height=camera["height"])
 
     # --- events -----------------------------------------------------------------------------------------------------
 

@@ -65,27 +65,6 @@ class FrameRow:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ViewRow:
-    """A frame whose depth answers overlap questions, without that depth.
-
-    Attributes:
-        section_id, section_row, frame_id: Which frame.
-        T_world_camera: float64 [4,4], by the newest versions of anchor and pose.
-        nearest, farthest: Least and largest raw depth in its image, holes left out; 0 if there is none.
-        camera, depth_scale_m: Of its section.
-    """
-
-    section_id: int
-    section_row: int
-    frame_id: int
-    T_world_camera: Pose
-    nearest: int
-    farthest: int
-    camera: Camera
-    depth_scale_m: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
     """Something that happened to a run: Unix time, a word, and what there is to say."""
@@ -121,14 +100,12 @@ def packed_facts(facts: Mapping[str, Any]) -> str:
     return json.dumps(_plain(facts), allow_nan=False, ensure_ascii=False)
 
 
-def packed_views(record: SectionRecord) -> list[tuple[int, int, int, bytes]]:
+def packed_views(record: SectionRecord) -> list[tuple[int, int, bytes]]:
     """The rows of the table ``views`` for a section."""
     rows = []
     for index, row in enumerate(record.view_index):
         depth = record.view_depth[index]
-        measured = depth[depth > 0]
-        near, far = (int(measured.min()), int(measured.max())) if measured.size else (0, 0)
-        rows.append((int(record.frame_ids[row]), near, far, CoarseDepth.of(depth).packed()))
+        rows.append((int(record.frame_ids[row]), int(depth.max()), CoarseDepth.of(depth).packed()))
     return rows
 
 

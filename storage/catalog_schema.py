@@ -49,7 +49,6 @@ CREATE TABLE quality (
 );
 CREATE TABLE views (
   frame_id INTEGER PRIMARY KEY REFERENCES frames ON DELETE CASCADE,
-  nearest INTEGER NOT NULL,        -- least raw depth in the image that is not 0, or 0
   farthest INTEGER NOT NULL,       -- largest raw depth in the image
   coarse BLOB NOT NULL             -- CoarseDepth.packed
 );

@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from vtslam.common.trajectory_io import trajectory_text
 from vtslam.storage.atomic import (
@@ -38,7 +39,7 @@ from vtslam.storage.catalog_rows import FrameRow, SectionRow
 from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked
 from vtslam.storage.run_info import RunInfo, read_run_info
 from vtslam.storage.section_facts import file_facts
-from vtslam.storage.section_file import read_section, write_section
+from vtslam.storage.section_file import read_columns, read_section, write_section
 from vtslam.storage.section_layout import CODEC
 from vtslam.storage.section_record import SectionRecord
 
@@ -248,6 +249,11 @@ class RunFolder:
         if record.section_id != section_id:
             raise MalformedSection.differing(path, "section_id", expected=section_id, found=record.section_id)
         return record
+
+    def read_views(self, section_id: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
+        """Rows [V] of the frames that a section keeps the depth of, and that depth [V,H,W]; raises StorageError."""
+        _, columns = read_columns(self.section_path(section_id), ["view_index", "view_depth"])
+        return columns["view_index"], columns["view_depth"]
 
     def _require_writable(self) -> None:
         if self._lock is None:

@@ -68,11 +68,13 @@ def seen_by_view(
         bool [N].
     """
     T = se3.inverse(T_world_view)
-    local = points_world_m @ T[:3, :3].T + T[:3, 3]
-    in_front = local[:, 2] > 0.0
-    z = np.where(in_front, local[:, 2], 1.0)
-    u = camera.fx * local[:, 0] / z + camera.cx
-    v = camera.fy * local[:, 1] / z + camera.cy
+    # Written out: what is found of a point must not depend on which other points are asked about with it.
+    points = np.ascontiguousarray(points_world_m.T)
+    x, y, depth_m = (row[0] * points[0] + row[1] * points[1] + row[2] * points[2] + row[3] for row in T[:3])
+    in_front = depth_m > 0.0
+    z = np.where(in_front, depth_m, 1.0)
+    u = camera.fx * x / z + camera.cx
+    v = camera.fy * y / z + camera.cy
     inside = in_front & (u >= border_px) & (v >= border_px)
     inside &= (u < camera.width - border_px) & (v < camera.height - border_px)
     out = np.zeros(points_world_m.shape[0], np.bool_)

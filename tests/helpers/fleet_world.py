@@ -26,6 +26,7 @@ from vtslam.common.topics import CONTROL, Role
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.map_follower import MapFollower, StoreArchive
 from vtslam.services.mapper.service import FleetPaths, MapperService
+from vtslam.services.section_map import ReadsSections
 from vtslam.services.sensor.service import RecordingSensor
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.system import System
@@ -79,12 +80,15 @@ class Result:
     poses: tuple[bytes, ...]
 
 
-class Sections(dict[int, Section]):
+class Sections(ReadsSections):
+    def __init__(self) -> None:
+        self.written: dict[int, Section] = {}
+
     def write(self, section: Section) -> None:
-        self[section.section_id] = section
+        self.written[section.section_id] = section
 
     def read(self, section_id: int) -> Section:
-        return self[section_id]
+        return self.written[section_id]
 
 
 @lru_cache(maxsize=1)
@@ -95,7 +99,7 @@ def expected() -> Result:
     reports = [system.process(source.frame(index)) for index in range(FRAMES)]
     system.finish()
     return Result(
-        tuple(section_bytes(section) for section in sections.values()),
+        tuple(section_bytes(section) for section in sections.written.values()),
         tuple(report.commit.T_world_camera.tobytes() for report in reports),
     )
 

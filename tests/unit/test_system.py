@@ -15,6 +15,7 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.native_engine import NativeEngine
+from vtslam.services.section_map import ReadsSections
 from vtslam.services.system import FrameReport, System
 from vtslam.services.tracker.state import ExternalPose, TrackingState
 from vtslam.storage.section_convert import record_of, section_of
@@ -32,7 +33,7 @@ SMALL = (
 
 
 @dataclass(slots=True)
-class MemoryArchive:
+class MemoryArchive(ReadsSections):
     """Sections as records, turned back on reading, as files would."""
 
     written: dict[int, Section] = field(default_factory=dict)
