@@ -64,9 +64,9 @@ class PointBlocks:
         """Points of the frame, N."""
         return int(self.rows.size)
 
-    def rows_in(self, blocks: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-        """The points, as in ``rows``, of the blocks bool [B]."""
-        return self.rows[np.repeat(blocks, self.counts)]
+    def points_in(self, blocks: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Which points, in the order of ``rows``, are in the blocks bool [B]; bool [N]."""
+        return np.repeat(blocks, self.counts)
 
     def bounding_sphere(self) -> tuple[Array, float]:
         """Center float64 [3] (m, world) and radius (m) of a sphere about all points; there must be one."""
@@ -166,8 +166,7 @@ class ViewBatch:
     def windows(self, blocks: PointBlocks) -> "Windows":
         """Where in the views' images, and how deep, the points of each block can be."""
         T, camera = self.T_world_view, self.camera
-        local = np.einsum("vbj,vji->ivb", blocks.centers_m[None] - T[:, None, :3, 3], T[:, :3, :3])
-        x, y, z = local
+        x, y, z = _seen_from(blocks.centers_m, T)
         r = blocks.radii_m[None] + _WORLD_SLACK * (1.0 + np.abs(T[:, :3, 3]).max(axis=1))[:, None]
         z0, z1 = z - r, z + r
         near = np.maximum(z0, _NEAR_M)
@@ -229,6 +228,15 @@ class Windows:
             least_m=self.least_m[views],
             most_m=self.most_m[views],
         )
+
+
+def _seen_from(points_m: Array, T_world_view: Array) -> Array:
+    """Points [B,3] in the coordinates of views [V,4,4], float64 [3,V,B]."""
+    middle = points_m.mean(axis=0)  # near the points: a map far from its origin loses no digits
+    rotations = T_world_view[:, :3, :3]
+    local = rotations.transpose(2, 0, 1).reshape(-1, 3) @ (points_m - middle).T
+    offsets = np.einsum("vj,vji->iv", middle - T_world_view[:, :3, 3], rotations)
+    return np.asarray(local.reshape(3, len(rotations), -1) + offsets[:, :, None])
 
 
 def _span(a: Array, r: Array, near: Array, far: Array, focal: float, middle: float) -> tuple[Array, Array]:

@@ -1,10 +1,4 @@
-"""The candidate views of a map of any length, and which of them see what a frame sees.
-
-What is kept of a view is small: pose, reach and where its depth is. Depth is read when it is needed. A frame's search
-goes from the cheap to the exact: balls in a grid, what lies in the image and within reach, coarse depth, and at last
-every point of what is left. Each step rules out only what the last one would find unseen, so the choice is that of an
-exhaustive search (`vtslam.common.overlap.selection`).
-"""
+"""The candidate views of a map of any length: little is kept of each, its depth is read when it is needed."""
 
 import math
 from collections import OrderedDict
@@ -14,11 +8,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.common.overlap.blocks import DepthPyramid, PointBlocks, ViewBatch
+from vtslam.common.overlap.blocks import DepthPyramid, ViewBatch
 from vtslam.common.overlap.coarse import CoarseDepth
-from vtslam.common.overlap.selection import CandidateView, seen_by_view, world_points_m
+from vtslam.common.overlap.selection import CandidateView
 from vtslam.common.overlap.view_grid import BallGrid
 from vtslam.common.settings import OverlapSettings
 
@@ -129,19 +122,6 @@ class ViewIndex:
         """Whether the head's view of a section is one of them; None if no view of the section is."""
         return None if section_id is None else self._heads.get(section_id)
 
-    def search(
-        self, frame: Frame, T_world_camera: Array, settings: OverlapSettings, *, only_head_of: int | None = None
-    ) -> "OverlapSearch":
-        """Look for views that see the points of ``frame`` at ``T_world_camera`` float64 [4,4].
-
-        Args:
-            frame: The frame.
-            T_world_camera: Its pose.
-            settings: Tolerance and border.
-            only_head_of: A section of which only the head's view counts; None if all do.
-        """
-        return OverlapSearch(self, frame, T_world_camera, settings, only_head_of)
-
     def batches(
         self, numbers: npt.NDArray[np.int64], settings: OverlapSettings
     ) -> list[tuple[npt.NDArray[np.int64], ViewBatch]]:
@@ -194,145 +174,6 @@ class ViewIndex:
             depth_scale_m=scale,
             camera=camera,
         )
-
-
-class OverlapSearch:
-    """One frame's question; shares are worked out as far as the answers need them.
-
-    Args:
-        index: The views.
-        frame, T_world_camera, settings, only_head_of: See `ViewIndex.search`.
-    """
-
-    def __init__(
-        self,
-        index: ViewIndex,
-        frame: Frame,
-        T_world_camera: Array,
-        settings: OverlapSettings,
-        only_head_of: int | None,
-    ) -> None:
-        self._index, self._frame, self._T_world_camera, self._settings = index, frame, T_world_camera, settings
-        self._only_head_of = only_head_of
-        self._blocks = PointBlocks.of(frame, T_world_camera)
-        self._points_m: Array | None = None
-        self._shares: dict[int, float] = {}
-        # By number of the view, in order; all others see nothing.
-        self._possible: dict[int, npt.NDArray[np.bool_]] = {}
-        self._bounds: dict[int, float] = {}
-        if self._blocks.num_points:
-            self._bound()
-
-    @property
-    def num_exact(self) -> int:
-        """Views that were looked at point by point so far."""
-        return len(self._shares)
-
-    def shares(self) -> dict[int, float]:
-        """Share of the frame's points that each view saw, by number of the view; those that saw none are left out."""
-        return {number: share for number in self._bounds if (share := self._share(number)) > 0.0}
-
-    def sections_to_pretrack(self, *, head_section_id: int) -> list[int]:
-        """As `vtslam.common.overlap.selection.sections_to_pretrack` over all views that count."""
-        settings, section_ids = self._settings, self._section_ids()
-        if section_ids is None:
-            return []
-        num_sections, last = section_ids
-        wanted = settings.max_sections if head_section_id > 2 else 1
-        wanted_now = min(wanted, num_sections)
-        gamma = settings.gamma
-        while True:
-            passing = self._passing(gamma, wanted)
-            if len(passing) >= wanted_now or gamma * settings.gamma_decay < settings.gamma_floor:
-                break
-            gamma *= settings.gamma_decay
-        return passing or [last]
-
-    def largest_overlap(self, *, excluded_section_id: int) -> int | None:
-        """As `vtslam.common.overlap.selection.largest_overlap` over all views that count."""
-        sections = self._index.rows["section_id"]
-        allowed = [number for number in self._bounds if sections[number] != excluded_section_id]
-        best: tuple[float, int] | None = None
-        for number in sorted(allowed, key=lambda n: (-self._bounds[n], n)):
-            if best is not None and self._bounds[number] < -best[0]:
-                break
-            share = self._share(number)
-            if share > 0.0:
-                best = min(best or (0.0, number), (-share, number))
-        return None if best is None else int(sections[best[1]])
-
-    def _section_ids(self) -> tuple[int, int] | None:
-        """How many sections have views that count, and the last one; None if none has."""
-        hidden = self._only_head_of if self._index.has_head(self._only_head_of) is False else None
-        of_views = self._index.rows["section_id"]
-        num_sections = self._index.num_sections - (hidden is not None)
-        if not num_sections:
-            return None
-        last = int(of_views[-1])
-        return num_sections, last if last != hidden else int(of_views[of_views < last][-1])
-
-    def _passing(self, gamma: float, wanted: int) -> list[int]:
-        """The first sections with a view that sees more than ``gamma``, at most ``wanted`` of them."""
-        by_section: OrderedDict[int, list[int]] = OrderedDict()
-        for number, bound in self._bounds.items():
-            if bound > gamma:
-                by_section.setdefault(int(self._index.rows["section_id"][number]), []).append(number)
-        passing: list[int] = []
-        for section_id, numbers in by_section.items():
-            numbers.sort(key=lambda n: -self._bounds[n])
-            if any(self._share(number) > gamma for number in numbers):
-                passing.append(section_id)
-                if len(passing) == wanted:
-                    break
-        return passing
-
-    def _bound(self) -> None:
-        """Largest possible shares, from coarse depth."""
-        index, blocks = self._index, self._blocks
-        center, radius = blocks.bounding_sphere()
-        numbers = self._counting(index.near(center, radius, self._settings.depth_consistency))
-        found: dict[int, npt.NDArray[np.bool_]] = {}
-        for own, batch in index.batches(numbers, self._settings):
-            windows = batch.windows(blocks)
-            reached = np.asarray(batch.within_reach(windows, index.rows["farthest"][own]).any(axis=1))
-            pyramids = [index.pyramid(int(number)) for number in own[reached]]
-            if pyramids:
-                nearest = np.stack([pyramid.nearest for pyramid in pyramids])
-                farthest = np.stack([pyramid.farthest for pyramid in pyramids])
-                possible = batch.possible(windows.of_views(reached), nearest, farthest)
-                found.update(zip(own[reached].tolist(), possible, strict=True))
-        for number in sorted(found):
-            count = int(blocks.counts[found[number]].sum())
-            if count:
-                self._possible[number] = found[number]
-                self._bounds[number] = count / blocks.num_points
-
-    def _counting(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        if self._only_head_of is None:
-            return numbers
-        rows = self._index.rows[numbers]
-        return np.asarray(numbers[(rows["section_id"] != self._only_head_of) | rows["is_head"]])
-
-    def _share(self, number: int) -> float:
-        """Share of the frame's points that a view saw, as `overlap_shares` has it."""
-        if number not in self._shares:
-            view = self._index.view(number)
-            seen = seen_by_view(
-                self._points()[self._blocks.rows_in(self._possible[number])],
-                T_world_view=view.T_world_camera,
-                view_depth=view.depth,
-                depth_scale_m=view.depth_scale_m,
-                camera=view.camera,
-                tolerance=self._settings.depth_consistency,
-                border_px=self._settings.border_share * view.camera.width,
-            )
-            self._shares[number] = int(np.count_nonzero(seen)) / self._blocks.num_points
-        return self._shares[number]
-
-    def _points(self) -> Array:
-        if self._points_m is None:
-            self._points_m = world_points_m(self._frame, self._T_world_camera, self._frame.depth > 0)
-        return self._points_m
 
 
 def _ball(view: ViewFacts) -> tuple[Array, float]:

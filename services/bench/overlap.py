@@ -16,6 +16,7 @@ from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.overlap.coarse import CoarseDepth
+from vtslam.common.overlap.search import OverlapSearch
 from vtslam.common.overlap.view_index import ViewFacts, ViewIndex
 from vtslam.common.settings import TrackerSettings
 from vtslam.storage.section_file import read_columns, write_columns
@@ -139,10 +140,12 @@ class _Choices:
         number = count - 1 if query % 2 else (query + 1) * count // (HEADS + 1)
         frame, T, head_section_id = _head(road, number, query), _pose(number, query), number // _VIEWS_OF_SECTION + 1
         start_s = time.perf_counter()
-        search = self._index.search(frame, T, self._settings)
+        search = OverlapSearch(self._index, frame, T, self._settings)
         search.sections_to_pretrack(head_section_id=head_section_id)
         selected_s = time.perf_counter()
-        self._index.search(frame, T, self._of_neighbours).largest_overlap(excluded_section_id=head_section_id - 1)
+        OverlapSearch(self._index, frame, T, self._of_neighbours).largest_overlap(
+            excluded_section_id=head_section_id - 1
+        )
         self.select_ms.append(1e3 * (selected_s - start_s))
         self.neighbour_ms.append(1e3 * (time.perf_counter() - selected_s))
         self.looked_at.append(search.num_exact)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.frame import Frame
+from vtslam.common.overlap.search import OverlapSearch
 from vtslam.common.overlap.view_index import ViewIndex
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
@@ -94,7 +95,7 @@ class MapperTurns:
             return []
         tracker = self._settings.tracker
         overlap = replace(tracker.overlap, depth_consistency=tracker.visibility_tolerance)
-        search = self._map.candidate_views().search(frame, T_world_camera, overlap)
+        search = OverlapSearch(self._map.candidate_views(), frame, T_world_camera, overlap)
         overlapping = search.largest_overlap(excluded_section_id=section_id - 1)
         ids = [section_id - 1] if overlapping is None else [section_id - 1, overlapping]
         return [self._map.section(i) for i in ids]

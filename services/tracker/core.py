@@ -12,6 +12,7 @@ import numpy.typing as npt
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.optim.alignment import PosePrior
+from vtslam.common.overlap.search import OverlapSearch
 from vtslam.common.overlap.view_index import ViewIndex
 from vtslam.common.section import Section
 from vtslam.common.settings import TrackerSettings
@@ -116,7 +117,7 @@ class Tracker:
             return [map_reader.section(section_id - 1)]
         overlap = self.settings.overlap
         only_head_of = section_id - 1 if overlap.skip_previous else None
-        search = map_reader.candidate_views().search(frame, T_guess, overlap, only_head_of=only_head_of)
+        search = OverlapSearch(map_reader.candidate_views(), frame, T_guess, overlap, only_head_of=only_head_of)
         ids = search.sections_to_pretrack(head_section_id=section_id)
         if not ids:
             return []

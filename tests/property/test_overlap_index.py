@@ -14,6 +14,7 @@ from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.overlap.blocks import PointBlocks
 from vtslam.common.overlap.coarse import BLOCK_PX, CoarseDepth
+from vtslam.common.overlap.search import OverlapSearch
 from vtslam.common.overlap.selection import (
     CandidateView,
     largest_overlap,
@@ -82,7 +83,7 @@ def test_the_choice_is_that_of_an_exhaustive_search(seed: int) -> None:
     for only_head_of in (None, last):
         counting = [view for view in views if view.section_id != only_head_of or view.is_head]
         shares = overlap_shares(world_points_m(frame, T, frame.depth > 0), counting, overlap)
-        search = index.search(frame, T, overlap, only_head_of=only_head_of)
+        search = OverlapSearch(index, frame, T, overlap, only_head_of=only_head_of)
         assert search.sections_to_pretrack(head_section_id=head) == sections_to_pretrack(
             shares, counting, head_section_id=head, settings=overlap
         )

@@ -1,16 +1,36 @@
 """A run that was cut off goes on, and leaves the bytes of an undisturbed one."""
 
+import errno
+import json
+import os
+import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
 import pytest
-from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
+from helpers.cli_runs import start_vtslam, wait_for
+from helpers.fleet_runs import (
+    ASSIGNMENTS,
+    FRAMES,
+    SECTION,
+    Disturbance,
+    SmallRecording,
+    fleet_run,
+    result_bytes,
+    small_plan,
+)
+from helpers.processes import children_of, leftovers
 from helpers.recordings import cut_in_half
+from helpers.small_runs import small_run
 
+from vtslam.common.fleet_folder import sweep_dead_fleets
+from vtslam.services.cli.__main__ import main
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.run_plan import plan_resume
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.storage import atomic
 from vtslam.storage.errors import ChecksumMismatch, RunFolderError, RunLocked, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
 
@@ -60,6 +80,86 @@ def test_a_run_in_one_process_goes_on_in_a_fleet(small: SmallRecording, tmp_path
 
     assert result_bytes(run) == small.undisturbed
     assert (again.frames, summary.frames, summary.sections) == (FRAMES, FRAMES, 4)
+
+
+def test_a_fleet_killed_as_a_whole_goes_on_twice(small: SmallRecording, tmp_path: Path) -> None:
+    run, words = tmp_path / "run", [word for each in ASSIGNMENTS for word in ("--set", each)]
+    commands = [["run", small.files.uri, "--out", str(run), "--family", "tum", *words], ["run", "--resume", str(run)]]
+    for command, section_id in zip(commands, (0, 2), strict=True):
+        process = start_vtslam(*command)
+        try:
+            wait_for(run / "sections" / f"{section_id:06d}.vts", process)
+            for pid in (process.pid, *children_of(process.pid)):
+                os.kill(pid, signal.SIGKILL)
+        finally:
+            process.kill()
+            process.communicate()
+    assert main(["sections", "repair", str(run)]) == 0
+    assert RunFolder.open(run).catalog.num_frames >= 2 * SECTION
+    assert main(["run", "--resume", str(run), "--json", str(tmp_path / "summary.json")]) == 0
+
+    assert result_bytes(run) == small.undisturbed
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == FRAMES
+    assert main(["sections", "verify", str(run)]) == 0
+    sweep_dead_fleets()
+    assert leftovers() == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run"], "run: expected SOURCE and --out RUN, or --resume RUN"),
+        (["run", "sim:room"], "run: expected SOURCE and --out RUN, or --resume RUN"),
+        (["run", "sim:room", "--resume", "RUN"], "goes on with the run's own source and settings"),
+        (["run", "--resume", "RUN", "--holdout", "3"], "goes on with the run's own source and settings"),
+    ],
+)
+def test_arguments_that_do_not_go_together(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_full_disk_ends_the_run_in_words_and_resume_finishes_it(
+    small: SmallRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class FullDisk(atomic.Disk):
+        def write(self, descriptor: int, data: bytes | memoryview) -> int:
+            if (run / "sections" / "000001.vts").exists():
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super().write(descriptor, data)
+
+    run, words = tmp_path / "run", [word for each in ASSIGNMENTS for word in ("--set", each)]
+    monkeypatch.setattr(atomic, "DISK", FullDisk())
+    assert main(["run", small.files.uri, "--out", str(run), "--family", "tum", *words]) == 1
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "cannot write: No space left on device" in told
+    assert told.endswith(f"what was stored is kept: vtslam run --resume {run}")
+    assert RunFolder.open(run).catalog.num_frames in (SECTION, 2 * SECTION)
+    monkeypatch.undo()
+
+    assert main(["run", "--resume", str(run)]) == 0
+    assert result_bytes(run) == small.undisturbed
+    assert leftovers() == []
+
+
+def test_a_run_that_was_set_aside_in_part_is_mapped_again_from_there(small: SmallRecording, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    small_plan(small.files).execute(run)
+    cut_in_half(run / "sections" / "000001.vts")
+    assert main(["sections", "repair", str(run)]) == 1
+    assert main(["run", "--resume", str(run), "--in-process"]) == 0
+
+    assert result_bytes(run) == small.undisturbed
+    assert (run / "damaged" / "000001-0.vts").exists()
+
+
+def test_a_run_that_publishers_fed_cannot_be_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = small_run(tmp_path / "run", 1)
+    with RunFolder.open(path, writable=True) as run:
+        info = run.read_info()
+        run.write_info(replace(info, facts=replace(info.facts, source="live:")))
+    assert main(["run", "--resume", str(path)]) == 1
+    assert "publishers fed this run, and their frames are gone" in capsys.readouterr().err
 
 
 def test_a_fleet_that_was_stopped_maps_its_short_section_again(small: SmallRecording, tmp_path: Path) -> None:
