@@ -7,6 +7,7 @@ points of what is left. Each step rules out only what the last one would find un
 
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -87,7 +88,7 @@ class OverlapSearch:
         for number in sorted(allowed, key=lambda n: (-self._bounds[n], n)):
             if self._bounds[number] < best_share:
                 break
-            share, most = self._look(number, lambda low, high, so_far=best_share: high >= so_far)
+            share, most = self._look(number, partial(_may_reach, best_share))
             if share == most and (share > best_share or (share == best_share > 0.0 and number < best)):
                 best_share, best = share, number
         return None if best < 0 else int(sections[best])
@@ -178,6 +179,10 @@ class OverlapSearch:
             points = world_points_m(self._frame, self._T_world_camera, self._frame.depth > 0)
             self._points_m = np.ascontiguousarray(points[self._blocks.rows].T)
         return self._points_m
+
+
+def _may_reach(share: float, low: float, high: float) -> bool:
+    return high >= share
 
 
 class _Look:
