@@ -170,8 +170,9 @@ class OverlapSearch:
 
     def _new_look(self, number: int) -> "_Look":
         view, settings = self._index.view(number), self._settings
-        points = np.compress(self._blocks.points_in(self._possible[number]), self._points(), axis=1)
-        return _Look(view, points, settings.depth_consistency, settings.border_share * view.camera.width)
+        rows = np.flatnonzero(self._blocks.points_in(self._possible[number])).astype(np.int32)
+        border_px = settings.border_share * view.camera.width
+        return _Look(view, self._points(), rows, settings.depth_consistency, border_px)
 
     def _points(self) -> Array:
         """The frame's points float64 [3,N], block by block."""
@@ -190,7 +191,8 @@ class _Look:
 
     Args:
         view: The view.
-        points_m: The points float64 [3,N], world.
+        points_m: The frame's points float64 [3,N], world.
+        rows: int32 [M], which of them it may have seen.
         tolerance, border_px: As in `seen_by_view`.
 
     Attributes:
@@ -198,16 +200,19 @@ class _Look:
         points_left: Points that were not looked at.
     """
 
-    def __init__(self, view: CandidateView, points_m: Array, tolerance: float, border_px: float) -> None:
-        self._view, self._points_m, self._tolerance, self._border_px = view, points_m, tolerance, border_px
+    def __init__(
+        self, view: CandidateView, points_m: Array, rows: npt.NDArray[np.int32], tolerance: float, border_px: float
+    ) -> None:
+        self._view, self._points_m, self._rows = view, points_m, rows
+        self._tolerance, self._border_px = tolerance, border_px
         self._image = view.depth.astype(np.float32)
-        self._parts = max(points_m.shape[1] // _POINTS_AT_ONCE, 1)
+        self._parts = max(rows.size // _POINTS_AT_ONCE, 1)
         self._part = self.seen = 0
-        self.points_left = points_m.shape[1]
+        self.points_left = rows.size
 
     def advance(self) -> None:
         """Look at one more part: points from all over the image."""
-        points = np.ascontiguousarray(self._points_m[:, self._part :: self._parts])
+        points = self._points_m[:, self._rows[self._part :: self._parts]]
         view = self._view
         seen = seen_columns(
             points,

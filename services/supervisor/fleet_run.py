@@ -82,6 +82,10 @@ def run_in_fleet(
             metrics.observe(facts)
             hooks.on_frame(facts)
 
+        def on_event(text: str) -> None:
+            run.catalog.add_event("restarted", text)
+            hooks.on_event(text)
+
         if resume is not None:
             section = SectionArchive(run).read(resume.section_id)
             store.restore(section, resume.frame, resume.facts.packed())
@@ -93,7 +97,7 @@ def run_in_fleet(
                 folder=folder,
                 recorder=recorder,
                 hang_s=settings.fleet.hang_s,
-                on_event=hooks.on_event,
+                on_event=on_event,
                 environment=hooks.environment,
             )
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
