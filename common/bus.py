@@ -104,7 +104,7 @@ class Publisher(Protocol[M_contra]):
 
         Raises:
             MessageError: A field holds what readers would refuse.
-            BusError: The session is closed.
+            BusError: The session is closed, or it cannot be sent; readers may get it all the same.
         """
         ...
 

@@ -13,6 +13,7 @@ from typing import Any
 from vtslam.common.topics import TOPICS, Role, checked_name
 
 LOCAL_USER = "local"  # login of the fleet's own processes, needed as soon as there are logins
+_OWN_LOGIN = "own-login"
 REMOTE_ROLES = frozenset({Role.REMOTE_SENSOR, Role.OBSERVER})
 
 
@@ -169,7 +170,25 @@ def write_password_file(path: Path, logins: Iterable[Login]) -> None:
     users = [login.user for login in entries]
     if len(set(users)) != len(users) or LOCAL_USER not in users:
         raise ValueError(f"users must be different and include {LOCAL_USER}, got {users}")
+    _write_logins(path, entries)
+
+
+def write_own_login(folder: Path, login: Login) -> None:
+    """Leave the login of a fleet's own processes in its private folder."""
+    _write_logins(folder / _OWN_LOGIN, [login])
+
+
+def own_login(folder: Path) -> Login | None:
+    """The login that :func:`write_own_login` left; None where there is no need of one."""
+    try:
+        user, _, password = (folder / _OWN_LOGIN).read_text().strip().partition(":")
+    except FileNotFoundError:
+        return None
+    return Login(user=user, password=password)
+
+
+def _write_logins(path: Path, logins: Iterable[Login]) -> None:
     path.unlink(missing_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     with os.fdopen(descriptor, "w") as file:
-        file.writelines(f"{login.user}:{login.password}\n" for login in entries)
+        file.writelines(f"{login.user}:{login.password}\n" for login in logins)

@@ -165,7 +165,11 @@ class Subscriber(Generic[M]):
     def lacks(self) -> bool:
         """Whether publishers should be asked for more; reading does so."""
         with self._lock:
-            return self._ask_again is not None and any(each.lacks for each in self._publishers.values())
+            return (
+                not self._closed
+                and self._ask_again is not None
+                and any(each.lacks for each in self._publishers.values())
+            )
 
     @property
     def waiting(self) -> int:

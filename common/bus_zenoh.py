@@ -16,7 +16,7 @@ import zenoh
 from zenoh import ext, handlers
 
 from vtslam.common.bus import Bus, BusError, Clock, Closeable, Member, SystemClock
-from vtslam.common.bus_access import Login, NetworkAccess
+from vtslam.common.bus_access import Login, NetworkAccess, own_login
 from vtslam.common.bus_config import Config, hub_config, member_config
 from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.bus_life import AliveWatcher
@@ -78,7 +78,7 @@ def join(member: Member, folder: Path, *, login: Login | None = None, timeout_s:
     Args:
         member: Who opens it.
         folder: The fleet's run-time folder.
-        login: Needed where the hub has a password file.
+        login: Needed where the hub has a password file; what the fleet left in its folder unless given.
         timeout_s: How long to wait for the hub.
 
     Raises:
@@ -86,7 +86,7 @@ def join(member: Member, folder: Path, *, login: Login | None = None, timeout_s:
         BusError: No hub took the connection within the time.
     """
     check_private_folder(folder)
-    return join_by(member, member_config(folder, login), timeout_s=timeout_s)
+    return join_by(member, member_config(folder, login or own_login(folder)), timeout_s=timeout_s)
 
 
 def join_by(member: Member, config: Config, *, timeout_s: float = 10.0, clock: Clock | None = None) -> "ZenohBus":
@@ -315,14 +315,16 @@ class _Publisher(Generic[M]):
                 publish_time_ns=self._bus.clock.wall_ns(),
                 max_bytes=self._topic.max_bytes,
             )
+            sequence = self._sequence
             if self._kept is not None:
-                self._kept.add(self._sequence, data)
+                self._kept.add(sequence, data)
+            # Also if sending fails: readers may ask for what is kept, and a number must not stand for two messages.
+            self._sequence += 1
             try:
                 self._declared.put(data)
             except zenoh.ZError as error:
                 raise BusError(f"{self._topic.suffix}: {error}") from error
-            self._sequence += 1
-            return self._sequence - 1
+            return sequence
 
     def close(self) -> None:
         with self._lock:

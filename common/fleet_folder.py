@@ -5,11 +5,12 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vtslam.common.private_folder import PrivateFolderError, check_private_folder
+from vtslam.common.shm.blocks import make_file, reserve
 from vtslam.common.shm.errors import DamagedBlock, FleetExists, SharedMemoryError
 from vtslam.common.shm.process_identity import boot_id, is_alive, own_identity
 from vtslam.common.topics import checked_name
@@ -18,8 +19,9 @@ SHARED_MEMORY = Path("/dev/shm")
 _HEX = re.compile("[0-9a-f]{1,16}")
 _PREFIX = "vtslam-"
 _NEW_PREFIX = ".vtslam-new-"  # then the maker's identity
-_OWNER, _RING, _MAP, _JOURNAL, _FAILED = "owner", "ring", "map", "journal", "failed"
+_OWNER, _RING, _MAP, _JOURNAL, _FAILED, _ENDED = "owner", "ring", "map", "journal", "failed", "ended"
 _MAX_OWNER_BYTES = 65536
+_FAILURE_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,16 +106,41 @@ class FleetFolder:
         """Where the committed frames are written for the run folder."""
         return self.path / _JOURNAL
 
+    def write_counts(self, name: str, counters: Mapping[str, int]) -> None:
+        """Leave what a process has counted in all, when it has come to its end."""
+        (self.path / f"{_ENDED}-{checked_name(name)}").write_text(json.dumps(dict(counters)), encoding="utf-8")
+
+    def counts(self, name: str) -> dict[str, int] | None:
+        """What a process that has come to its end had counted; None if it left nothing."""
+        try:
+            return dict(json.loads((self.path / f"{_ENDED}-{checked_name(name)}").read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            return None
+
+    def reserve_failure(self, name: str) -> None:
+        """Make room for :meth:`write_failure`, whose reason may be that there is none; raises SharedMemoryFull."""
+        path = self._failure_path(name)
+        path.unlink(missing_ok=True)
+        fd = make_file(path, _FAILURE_BYTES)
+        try:
+            reserve(path, fd, 0, _FAILURE_BYTES)
+        finally:
+            os.close(fd)
+
     def write_failure(self, name: str, text: str) -> None:
-        """Leave word of why the process ``name`` cannot go on."""
-        (self.path / f"{_FAILED}-{checked_name(name)}").write_text(text, encoding="utf-8")
+        """Leave word of why the process ``name`` cannot go on, in the room reserved for it."""
+        with open(self._failure_path(name), "r+b") as file:
+            file.write(text.encode()[:_FAILURE_BYTES].ljust(_FAILURE_BYTES, b"\0"))
 
     def failure(self, name: str) -> str:
         """What :meth:`write_failure` left; empty if nothing."""
         try:
-            return (self.path / f"{_FAILED}-{checked_name(name)}").read_text(encoding="utf-8")
+            return self._failure_path(name).read_bytes().rstrip(b"\0").decode(errors="replace")
         except FileNotFoundError:
             return ""
+
+    def _failure_path(self, name: str) -> Path:
+        return self.path / f"{_FAILED}-{checked_name(name)}"
 
     def remove(self) -> None:
         """Delete the folder and all blocks; memory is freed when the last process has unmapped it."""

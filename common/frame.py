@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.geometry.camera import Camera
 
 
@@ -20,6 +21,7 @@ class Frame:
         depth: uint16 [H,W], in units of ``depth_scale_m`` along the optical axis; 0 means no depth.
         depth_scale_m: Metres per depth unit.
         camera: Intrinsics of both images (they are registered).
+        pose_prior: Where something else than the tracker says the camera was; None if nothing does.
 
     Raises:
         ValueError: An array has another shape or type than stated, or the scale is not positive.
@@ -31,6 +33,7 @@ class Frame:
     depth: npt.NDArray[np.uint16]
     depth_scale_m: float
     camera: Camera
+    pose_prior: ExternalPose | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

@@ -16,7 +16,6 @@ from vtslam.common.messages import (
     FramePixels,
     Message,
     Odometry,
-    PosePrior,
     SectionArchived,
     SectionReply,
     SectionRequest,
@@ -185,15 +184,6 @@ SENSOR_CREDIT = Topic(
     publishers=_by(Role.SENSOR),
     readers_elsewhere=_by(Role.REMOTE_SENSOR),
 )
-SENSOR_POSE_PRIOR = Topic(
-    suffix="sensor/pose_prior",
-    message=PosePrior,
-    overflow=Overflow.OLDEST_GOES,
-    history=256,
-    rate_hz=None,
-    recorded=True,
-    publishers=_by(Role.SENSOR, Role.REMOTE_SENSOR),
-)
 TRACKER_POSE = Topic(
     suffix="tracker/pose",
     message=TrackedPose,
@@ -277,7 +267,6 @@ TOPICS: tuple[Topic[Any], ...] = (
     SENSOR_FRAME,
     SENSOR_PIXELS,
     SENSOR_CREDIT,
-    SENSOR_POSE_PRIOR,
     TRACKER_POSE,
     TRACKER_ODOMETRY,
     MAPPER_COMMITTED,

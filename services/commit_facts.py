@@ -19,6 +19,7 @@ class CommitFacts:
 
     Attributes:
         num_frames: Frames committed, this one included.
+        num_tracked: Frames tracked when this one was, itself included; in realtime more than are committed.
         sequence: The frame's number in the frame ring.
         iterations: Optimiser steps spent on it.
         frame: The frame.
@@ -28,6 +29,7 @@ class CommitFacts:
     """
 
     num_frames: int
+    num_tracked: int
     sequence: int
     iterations: int
     frame: CommittedFrame
@@ -64,6 +66,7 @@ class CommitFacts:
         before = None if self.T_world_previous is None else self.T_world_previous.tolist()
         plain = {
             "num_frames": self.num_frames,
+            "num_tracked": self.num_tracked,
             "sequence": self.sequence,
             "iterations": self.iterations,
             "frame": self.frame.as_plain(),
@@ -80,6 +83,7 @@ class CommitFacts:
         before = plain["T_world_previous"]
         return cls(
             num_frames=plain["num_frames"],
+            num_tracked=plain["num_tracked"],
             sequence=plain["sequence"],
             iterations=plain["iterations"],
             frame=CommittedFrame.from_plain(plain["frame"]),

@@ -1,6 +1,7 @@
 """The rasteriser that the settings ask for; an engine is imported only when it is chosen."""
 
 import os
+from dataclasses import replace
 
 from vtslam.common.config import ConfigError
 from vtslam.common.settings import SplatSettings
@@ -11,6 +12,11 @@ from vtslam.services.process_facts import package_version
 def thread_count(settings: SplatSettings) -> int:
     """Threads of the CPU engine: as set, or one per core that this process may use."""
     return settings.threads or len(os.sched_getaffinity(0))
+
+
+def with_threads(settings: SplatSettings, threads: int) -> SplatSettings:
+    """The settings with that many threads; 0 leaves them as they are."""
+    return replace(settings, threads=threads or settings.threads)
 
 
 def make_engine(settings: SplatSettings) -> Engine:

@@ -10,6 +10,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from vtslam.common.shm.blocks import refusal_of
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame
 
@@ -35,14 +36,21 @@ class JournalWriter:
         self._file: tuple[int, int] | None = None  # section and descriptor
 
     def append(self, facts: CommitFacts, *, section_ended: bool) -> None:
-        """Write a frame's line."""
+        """Write a frame's line; raises SharedMemoryFull with nothing written."""
         plain = facts.frame.as_plain()
         if section_ended:
             plain["ended"] = facts.packed().decode()
         data = json.dumps(plain).encode() + b"\n"
-        descriptor = self._descriptor(facts.frame.facts.section_id)
-        while data:
-            data = data[os.write(descriptor, data) :]
+        section_id = facts.frame.facts.section_id
+        descriptor = self._descriptor(section_id)
+        start, written = os.lseek(descriptor, 0, os.SEEK_CUR), 0
+        try:
+            while written < len(data):
+                written += os.write(descriptor, data[written:])
+        except OSError as error:
+            os.ftruncate(descriptor, start)
+            os.lseek(descriptor, start, os.SEEK_SET)
+            raise refusal_of(_path(self._folder, section_id), error, len(data)) from error
 
     def close(self) -> None:
         """Give the descriptor back."""

@@ -11,7 +11,7 @@ from vtslam.common.overlap.coarse import CoarseDepth
 from vtslam.common.overlap.view_index import ViewFacts
 from vtslam.common.section import Section
 from vtslam.common.shm.active_reader import ActiveReader, PinnedActive
-from vtslam.common.shm.errors import SectionNotResident
+from vtslam.common.shm.errors import GenerationGone, SectionNotResident
 from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.section_map import ReadsSections, SectionMap
@@ -70,7 +70,7 @@ def _copied(section: Section) -> Section:
 
 
 class MapFollower:
-    """The map as of the last commit.
+    """What was committed last, and the map as of that commit or of one shortly before it.
 
     Args:
         store: The map store.
@@ -78,9 +78,9 @@ class MapFollower:
         candidate_interval: Every so many frames of a section one answers overlap questions.
 
     Attributes:
-        map: The map; the active section's arrays are the store's own, and valid until the next :meth:`refresh`.
-        facts: What else was committed; None before the first commit.
-        frame: The frame committed last, in place likewise; None before the first commit.
+        map: The map; the active section's arrays are the store's own, and valid until the next :meth:`go_to`.
+        facts: What was committed last, beside the map; None before the first commit.
+        frame: The frame committed last, in place; None before the first commit.
     """
 
     def __init__(self, store: MapStore, archive: ReadsSections, *, candidate_interval: int) -> None:
@@ -90,61 +90,88 @@ class MapFollower:
         self.frame: Frame | None = None
         self._reader: tuple[int, ActiveReader] | None = None
         self._held: PinnedActive | None = None
-        self._seen = (-1, -1)  # section and generation; after a section was sealed, the next one and 0
+        self._seen = (-1, -1)  # section and generation of the last commit; of a sealed section, the next one and 0
+        self._at = (-1, -1)  # section and generation of the map's active section
 
     @property
     def num_frames(self) -> int:
         """Frames committed."""
         return 0 if self.facts is None else self.facts.num_frames
 
-    def refresh(self) -> bool:
-        """Go on to the last commit; whether there was a new one."""
+    @property
+    def active_id(self) -> int | None:
+        """The section that was committed to last, if it is not sealed."""
+        return self._seen[0] if self._seen[1] > 0 else None
+
+    def refresh(self) -> None:
+        """Go on to the last commit, and the map to it."""
+        while True:
+            self.look()
+            if self.active_id is None or self.go_to(self.active_id, self._seen[1]):
+                return
+
+    def look(self) -> None:
+        """Learn of the last commit. The map stays where it is, unless a section was sealed: then it goes there."""
         while True:
             try:
-                return self._refresh()
+                return self._look()
             except SectionNotResident:  # sealed at this moment
                 self._reader = None
 
-    def _refresh(self) -> bool:
+    def go_to(self, section_id: int, generation: int) -> bool:
+        """Let the map be that of a commit of the active section; false if it is not there (yet, or any more).
+
+        Which commits are still there, the section's writer decides (`ActiveSpec.kept_generations`).
+        """
+        if self._at == (section_id, generation):
+            return True
+        if self._seen[0] != section_id or self._reader is None or self._reader[1].generation < generation:
+            return False
+        try:
+            held = self._reader[1].pinned(generation)
+        except (GenerationGone, SectionNotResident):
+            return False
+        former = self.map.active
+        if self._at[0] == section_id and self._at[1] < generation and former is not None:
+            self.map.committed(held.state.section.continued(former))
+        else:
+            self.map.committed(held.state.section.retied())
+        self.release()
+        self._held, self._at = held, (section_id, generation)
+        return True
+
+    def _look(self) -> None:
         section_id = self._store.active_id()
         if section_id is None:
-            return self._follow_sealed()
+            return self._look_at_sealed()
         if self._reader is None or self._reader[0] != section_id:
             self._reader = section_id, self._store.active_reader(section_id)
         reader = self._reader[1]
         if reader.generation == 0:
-            return self._follow_sealed()
+            return self._look_at_sealed()
         if self._seen == (section_id, reader.generation):
-            return False
+            return None
         held = reader.pinned()
-        self._take(held)
-        self._seen = section_id, held.state.generation
-        return True
+        try:
+            # Images are written once and stay where they are: no pin is needed to look at them.
+            self.facts, self.frame = CommitFacts.unpacked(held.state.facts), held.state.frames[-1]
+            self._seen = section_id, held.state.generation
+        finally:
+            held.release()
+        return None
 
-    def _take(self, held: PinnedActive) -> None:
-        state, former = held.state, self.map.active
-        if former is not None and former.section_id == state.section.section_id:
-            section = state.section.continued(former)
-        else:
-            section = state.section.retied()
-        self.map.committed(section)
-        self.facts, self.frame = CommitFacts.unpacked(state.facts), state.frames[-1]
-        self.release()
-        self._held = held
-
-    def _follow_sealed(self) -> bool:
+    def _look_at_sealed(self) -> None:
         """No active section, or one without a commit: the last commit is a sealed section's."""
         sealed = self._store.sealed_ids()
         if not sealed or self._seen == (sealed[-1] + 1, 0):
-            return False
+            return
         last = self._store.last_commit()
         if last is None or not last.is_sealed:
-            return False
+            return
         self.map.sealed(self._archive.read(last.section_id))
         self.facts, self.frame = CommitFacts.unpacked(last.facts), last.frame
         self.release()
-        self._seen = last.section_id + 1, 0
-        return True
+        self._seen = self._at = last.section_id + 1, 0
 
     def release(self) -> None:
         """Let go of the store."""

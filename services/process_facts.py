@@ -1,4 +1,4 @@
-"""What a process can say of itself: memory, and the versions its results may depend on."""
+"""What a process can say of itself (memory, the versions its results may depend on), and of other processes."""
 
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -36,7 +36,41 @@ def peak_rss_mb() -> float:
 
     From the kernel's VmHWM: getrusage would also count what the process was before it became this program.
     """
-    for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():
-        if line.startswith("VmHWM:"):
+    return _status_mb(_STATUS, "VmHWM:")
+
+
+def private_rss_mb(pid: int) -> float:
+    """Memory of a process that is no file's and nobody else's (RssAnon), in 10^6 bytes; 0 if there is no such one."""
+    try:
+        return _status_mb(Path(f"/proc/{pid}/status"), "RssAnon:")
+    except OSError:
+        return 0.0
+
+
+def _status_mb(path: Path, key: str) -> float:
+    for line in path.read_text(encoding="ascii", errors="replace").splitlines():
+        if line.startswith(key):
             return int(line.split()[1]) * 1024 / 1e6
     return 0.0
+
+
+def is_gone(pid: int) -> bool:
+    """Whether there is no such process, or only what its parent has not taken note of."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+def children_of(pid: int) -> set[int]:
+    """Pids of a process's children."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = path.read_text().rpartition(")")[2].split()[1]  # the name before it may hold anything
+        except OSError:
+            continue
+        if int(parent) == pid:
+            found.add(int(path.parent.name))
+    return found

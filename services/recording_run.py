@@ -144,6 +144,7 @@ class _Recorder:
         poses, num_frames = state.committed_poses, self._record.num_frames
         return CommitFacts(
             num_frames=num_frames,
+            num_tracked=num_frames,
             sequence=num_frames,
             iterations=self._report.commit.iterations,
             frame=last,

@@ -14,6 +14,7 @@ from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import program_version, versions
 from vtslam.services.recording_run import run_recording
 from vtslam.services.resume import ResumePoint, prepare_to_resume
@@ -191,6 +192,8 @@ def plan_resume(folder: Path) -> RunPlan:
     if facts.source == LIVE_SOURCE:
         raise RunFolderError(f"{folder}: publishers fed this run, and their frames are gone; it cannot be resumed")
     settings: Settings = load(Settings, [(f"{folder / 'run.toml'} [settings]", info.settings)])
+    if pace_of(settings.fleet, live=False).is_realtime:
+        raise RunFolderError(f"{folder}: this run dropped frames to keep up with time; it cannot be resumed")
     source = open_source(facts.source)
     found = (source.camera.width, source.camera.height, len(source))
     if found != (facts.width, facts.height, facts.end_frame):

@@ -1,6 +1,7 @@
 """What a run leaves in its folder: sections as they become durable with their frames, and the sums at its end."""
 
 from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame
@@ -44,6 +45,7 @@ class RunRecord:
     def __init__(self, run: RunFolder) -> None:
         self._run = run
         self._num_durable = run.catalog.num_frames
+        self._last_durable = run.catalog.last_frame_id
         self._frames: list[CommittedFrame] = []
 
     @property
@@ -51,11 +53,16 @@ class RunRecord:
         """Frames committed."""
         return self._num_durable + len(self._frames)
 
+    @property
+    def last_frame_id(self) -> int:
+        """The frame committed last; -1 if there is none."""
+        return self._frames[-1].facts.frame_id if self._frames else self._last_durable
+
     def add(self, frame: CommittedFrame) -> None:
         """One more frame, or the last one again with what was learned of it since; durable ones are left alone."""
         if self._frames and self._frames[-1].facts.frame_id == frame.facts.frame_id:
             self._frames.pop()
-        if frame.facts.frame_id >= self._num_durable:
+        if frame.facts.frame_id > self._last_durable:
             self._frames.append(frame)
 
     def last(self) -> CommittedFrame | None:
@@ -73,18 +80,21 @@ class RunRecord:
             StorageError: It cannot be written.
         """
         frames = [frame for frame in self._frames if frame.facts.section_id == section.section_id]
-        rows = [
-            FrameRow(
-                frame_id=frame.facts.frame_id,
-                capture_time_ns=frame.capture_time_ns,
-                T_world_camera=frame.T_world_camera,
-                facts=asdict(frame.facts),
-            )
-            for frame in frames
-        ]
-        self._run.commit_section(section, rows, resume=None if boundary is None else boundary.packed())
+        resume = None if boundary is None else boundary.packed()
+        self._run.commit_section(section, [_row_of(frame) for frame in frames], resume=resume)
         self._num_durable += len(frames)
+        self._last_durable = frames[-1].facts.frame_id
         self._frames = self._frames[len(frames) :]
+
+    def finish_broken(self, *, seconds: float, peak_rss_mb: float) -> None:
+        """Write what a run came to that cannot go on, with the frames whose section is on no disk.
+
+        Raises:
+            StorageError: It cannot be written.
+        """
+        for section_id, frames in groupby(self._frames, key=lambda frame: frame.facts.section_id):
+            self._run.add_loose_frames(section_id, [_row_of(frame) for frame in frames])
+        self.finish(finished=False, interrupted=False, seconds=seconds, peak_rss_mb=peak_rss_mb)
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
         """Write what the run came to; frames that are not durable do not count.
@@ -129,3 +139,12 @@ class RunRecord:
             seconds=seconds,
             peak_rss_mb=peak_rss_mb,
         )
+
+
+def _row_of(frame: CommittedFrame) -> FrameRow:
+    return FrameRow(
+        frame_id=frame.facts.frame_id,
+        capture_time_ns=frame.capture_time_ns,
+        T_world_camera=frame.T_world_camera,
+        facts=asdict(frame.facts),
+    )

@@ -22,6 +22,7 @@ class ServiceLink:
     Attributes:
         drain_through: Finish the frames up to this one, then end; None while there is no such order.
         stopping: Finish the step at hand, then end.
+        counters, gauges: Figures of the status, by name.
     """
 
     def __init__(self, bus: Bus, epoch: int) -> None:
@@ -35,6 +36,7 @@ class ServiceLink:
         self.drain_through: int | None = None
         self.stopping = False
         self.counters: dict[str, int] = {}
+        self.gauges: dict[str, float] = {}
 
     def count(self, what: str, number: int = 1) -> None:
         """Add to a counter of the status."""
@@ -75,7 +77,7 @@ class ServiceLink:
                 state=state,
                 last_frame_id=last_frame_id,
                 counters=dict(self.counters),
-                gauges={"peak_rss_mb": peak_rss_mb()},
+                gauges={**self.gauges, "peak_rss_mb": peak_rss_mb()},
                 detail="".join(c for c in detail if c.isprintable())[:256],
             )
         )

@@ -16,7 +16,7 @@ from vtslam.services.mapper.turns import MapperTurns
 from vtslam.services.section_map import ReadsSections, SectionMap
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.masks import mean_depth_m
-from vtslam.services.tracker.state import ExternalPose, TrackerState, TrackResult
+from vtslam.services.tracker.state import TrackerState, TrackResult, first_pose
 
 
 class Archive(ReadsSections, Protocol):
@@ -93,26 +93,24 @@ class System:
         self,
         frame: Frame,
         *,
-        prior: ExternalPose | None = None,
         known_T_world_camera: npt.NDArray[np.float64] | None = None,
     ) -> FrameReport:
         """Track and map the next frame; seals its section if it is the last of it.
 
         Args:
-            frame: The frame.
-            prior: A pose from elsewhere that tracking weighs by its covariance.
+            frame: The frame; a pose prior that comes with it is weighed by its covariance.
             known_T_world_camera: float64 [4,4], its pose if that is known: it is mapped there, not tracked.
         """
         section_id, row = divmod(self._frames, self.settings.section.length)
         tracking, start_s, budget_s = None, self._clock(), self.settings.mapper.budget_s
         if self._frames > 0 and known_T_world_camera is None:
             tracking = self._tracker.track(
-                frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=prior
+                frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
             )
         if known_T_world_camera is not None:
             T_world_camera = known_T_world_camera
         else:
-            T_world_camera = self._first_pose(prior) if tracking is None else tracking.T_world_camera
+            T_world_camera = first_pose(frame) if tracking is None else tracking.T_world_camera
         tracked_s = self._clock()
         self.active, commit = self._mapper.map(
             frame,
@@ -141,10 +139,6 @@ class System:
     def finish(self) -> int:
         """Seal the section that is still open, if any; returns the renders spent."""
         return 0 if self.active is None else self._seal()
-
-    @staticmethod
-    def _first_pose(prior: ExternalPose | None) -> npt.NDArray[np.float64]:
-        return np.eye(4) if prior is None else prior.T_world_camera
 
     def _seal(self) -> int:
         assert self.active is not None

@@ -44,9 +44,9 @@ FROM frames f JOIN quality q USING (frame_id) ORDER BY f.frame_id"""
 _NEWEST = """
 SELECT f.frame_id, f.capture_time_ns, f.T_world_committed, a.version, a.T_world_section, p.version, p.T_section_frame
 FROM frames f
-JOIN poses p ON p.frame_id = f.frame_id
+LEFT JOIN poses p ON p.frame_id = f.frame_id
   AND p.version = (SELECT max(version) FROM poses WHERE frame_id = f.frame_id)
-JOIN anchors a ON a.section_id = f.section_id
+LEFT JOIN anchors a ON a.section_id = f.section_id
   AND a.version = (SELECT max(version) FROM anchors WHERE section_id = f.section_id)
 ORDER BY f.frame_id"""
 _VIEWS = """
@@ -145,28 +145,30 @@ class Catalog:
             StorageError: It cannot be written.
         """
         assert [frame.frame_id for frame in frames] == record.frame_ids.tolist()
-        try:
-            facts = [packed_facts(frame.facts) for frame in frames]
-        except TypeError as error:
-            raise RunFolderError(
-                f"{self.path}: facts of section {row.section_id} have no JSON form: {error}"
-            ) from error
+        facts = self._packed_facts(row.section_id, frames)
         with self._transaction() as db:
             db.execute(
                 f"INSERT INTO sections ({_SECTION_COLUMNS}, resume) VALUES (?,?,?,?,?,?,?,?,?,?,?,?)",
                 (*_section_values(row), resume),
             )
             db.execute("INSERT INTO anchors VALUES (?,0,?)", (row.section_id, packed_pose(record.T_world_section)))
-            for index, frame in enumerate(frames):
-                T_world = packed_pose(frame.T_world_camera)
-                db.execute(
-                    "INSERT INTO frames VALUES (?,?,?,?,?)",
-                    (frame.frame_id, row.section_id, index, frame.capture_time_ns, T_world),
-                )
-                T_section = packed_pose(record.T_section_frame[index])
-                db.execute("INSERT INTO poses VALUES (?,0,?)", (frame.frame_id, T_section))
-                db.execute("INSERT INTO quality VALUES (?,?)", (frame.frame_id, facts[index]))
+            _insert_frames(db, row.section_id, frames, facts)
+            poses = [(frame.frame_id, packed_pose(T)) for frame, T in zip(frames, record.T_section_frame, strict=True)]
+            db.executemany("INSERT INTO poses VALUES (?,0,?)", poses)
             db.executemany("INSERT INTO views VALUES (?,?,?)", packed_views(record))
+
+    def add_loose_frames(self, section_id: int, frames: Sequence[FrameRow]) -> None:
+        """Enter the frames of a section that will never be on disk; raises as :meth:`add_section`."""
+        facts = self._packed_facts(section_id, frames)
+        with self._transaction() as db:
+            _insert_frames(db, section_id, frames, facts)
+
+    def _packed_facts(self, section_id: int, frames: Sequence[FrameRow]) -> list[str]:
+        try:
+            return [packed_facts(frame.facts) for frame in frames]
+        except TypeError as error:
+            text = f"{self.path}: facts of section {section_id} have no JSON form: {error}"
+            raise RunFolderError(text) from error
 
     def sections(self) -> list[SectionRow]:
         """All sections, in order."""
@@ -197,6 +199,11 @@ class Catalog:
         """Frames of all sections."""
         return int(self._rows("SELECT count(*) FROM frames")[0][0])
 
+    @property
+    def last_frame_id(self) -> int:
+        """The last frame; -1 if there is none."""
+        return int(self._rows("SELECT coalesce(max(frame_id), -1) FROM frames")[0][0])
+
     def totals(self) -> Totals:
         """Sums over all sections."""
         sections = "SELECT count(*), coalesce(sum(num_gaussians), 0), coalesce(sum(num_bytes), 0) FROM sections"
@@ -214,6 +221,7 @@ class Catalog:
         """Forget a section and all later ones, all at once; their files are the caller's to delete afterwards."""
         with self._transaction() as db:
             db.execute("DELETE FROM sections WHERE section_id >= ?", (section_id,))
+            db.execute("DELETE FROM frames WHERE section_id >= ?", (section_id,))
 
     def set_missing(self, section_id: int) -> None:
         """Note that a section's file was set aside."""
@@ -243,7 +251,7 @@ class Catalog:
         times, poses = [], []
         for _, time_ns, committed, anchor_version, anchor, pose_version, pose in self._each(_NEWEST):
             times.append(time_ns)
-            corrected = anchor_version > 0 or pose_version > 0
+            corrected = (anchor_version or 0) > 0 or (pose_version or 0) > 0
             poses.append(unpacked_pose(anchor) @ unpacked_pose(pose) if corrected else unpacked_pose(committed))
         return np.array(times, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4)
 
@@ -323,6 +331,16 @@ class Catalog:
     def _each(self, sql: str, *values: object) -> Iterator[Any]:
         with _translated(self.path):
             yield from self._connection.execute(sql, values)
+
+
+def _insert_frames(db: sqlite3.Connection, section_id: int, frames: Sequence[FrameRow], facts: Sequence[str]) -> None:
+    rows = [
+        (frame.frame_id, section_id, index, frame.capture_time_ns, packed_pose(frame.T_world_camera))
+        for index, frame in enumerate(frames)
+    ]
+    db.executemany("INSERT INTO frames VALUES (?,?,?,?,?)", rows)
+    quality = [(frame.frame_id, text) for frame, text in zip(frames, facts, strict=True)]
+    db.executemany("INSERT INTO quality VALUES (?,?)", quality)
 
 
 def _connected(path: Path, mode: str) -> sqlite3.Connection:

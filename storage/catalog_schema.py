@@ -31,7 +31,7 @@ CREATE TABLE anchors (
 ) WITHOUT ROWID;
 CREATE TABLE frames (
   frame_id INTEGER PRIMARY KEY,
-  section_id INTEGER NOT NULL REFERENCES sections ON DELETE CASCADE,
+  section_id INTEGER NOT NULL,     -- none of the table for frames of a section that never was finished
   section_row INTEGER NOT NULL,
   capture_time_ns INTEGER NOT NULL,
   T_world_committed BLOB NOT NULL  -- T_world_camera as it was committed

@@ -232,6 +232,15 @@ class RunFolder:
             codec=codec,
         )
         self.catalog.add_section(record, row, frames, resume=resume)
+        self._lengthen_trajectory(frames)
+
+    def add_loose_frames(self, section_id: int, frames: Sequence[FrameRow]) -> None:
+        """Keep the poses and facts of frames whose section will never be on disk; raises StorageError."""
+        self._require_writable()
+        self.catalog.add_loose_frames(section_id, frames)
+        self._lengthen_trajectory(frames)
+
+    def _lengthen_trajectory(self, frames: Sequence[FrameRow]) -> None:
         times_ns, poses = [frame.capture_time_ns for frame in frames], [frame.T_world_camera for frame in frames]
         append_to_file(self.trajectory_path, trajectory_text(times_ns, np.stack(poses)).encode("ascii"))
 

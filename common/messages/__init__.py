@@ -6,8 +6,6 @@ from vtslam.common.messages.mapping import (
     FrameCommitted,
     LoadOutcome,
     Odometry,
-    PoseQuality,
-    PoseState,
     SectionArchived,
     SectionReply,
     SectionRequest,
@@ -17,7 +15,7 @@ from vtslam.common.messages.mapping import (
 )
 from vtslam.common.messages.rules import MessageError, Reason
 from vtslam.common.messages.running import Command, Control, ServiceState, ServiceStatus
-from vtslam.common.messages.sensing import Credit, FrameCondition, FrameDescriptor, FramePixels, PosePrior
+from vtslam.common.messages.sensing import Credit, FrameCondition, FrameDescriptor, FramePixels
 
 __all__ = [
     "Command",
@@ -32,9 +30,6 @@ __all__ = [
     "Message",
     "MessageError",
     "Odometry",
-    "PosePrior",
-    "PoseQuality",
-    "PoseState",
     "Reason",
     "SectionArchived",
     "SectionReply",

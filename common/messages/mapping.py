@@ -23,41 +23,13 @@ from vtslam.common.messages.base import (
 )
 from vtslam.common.messages.rules import COVARIANCE, Choice, Fields, Flag, Integer, Maybe, Numbers, Real, Series
 from vtslam.common.messages.rules import MAX_INT as _MAX
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 
 _Covariance = Annotated[npt.NDArray[np.float64], COVARIANCE]
 
 
-class PoseState(StrEnum):
-    """How far a pose can be trusted; the values of the tracker's states."""
-
-    OK = "ok"
-    WEAK = "weak"
-    LOST = "lost"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseQuality:
-    """What an estimated pose rests on.
-
-    Attributes:
-        color_loss: Mean over the mask of sum_c |I - I'| at the last render.
-        depth_loss_m: Mean over the mask of |D - D'| at the last render.
-        covered_share: Pixels in the mask over all pixels.
-        renders: Renders spent.
-        section_id: The section it was tracked against; -1 if none.
-        rescued: Whether RGB-D odometry replaced the guess.
-    """
-
-    color_loss: float
-    depth_loss_m: float
-    covered_share: float
-    renders: int
-    section_id: int
-    rescued: bool
-
-
 _QUALITY = Fields(
-    PoseQuality,
+    TrackingQuality,
     {
         "color_loss": Real(0.0),
         "depth_loss_m": Real(0.0),
@@ -117,11 +89,12 @@ class TrackedPose(Message):
         state: Whether to trust it.
         overlap_section_id: For heads, the section it was tracked against; -1 otherwise.
         history: What the tracker remembers once the frame is committed.
+        num_tracked: Frames tracked so far, this one included; in realtime fewer than were published.
         read_s, track_s: Seconds that reading the frame from its source and tracking it took.
     """
 
     KIND: ClassVar[str] = "tracked_pose"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     frame_id: Count
     capture_time_ns: Count
@@ -132,10 +105,11 @@ class TrackedPose(Message):
     epoch: Count
     T_world_camera: Pose
     covariance: _Covariance
-    quality: Annotated[PoseQuality | None, Maybe(_QUALITY)]
-    state: Annotated[PoseState, Choice(PoseState)]
+    quality: Annotated[TrackingQuality | None, Maybe(_QUALITY)]
+    state: Annotated[TrackingState, Choice(TrackingState)]
     overlap_section_id: OptionalId
     history: Annotated[TrackerHistory, _HISTORY] = field(default_factory=TrackerHistory)
+    num_tracked: Count = 0
     read_s: NonNegative = 0.0
     track_s: NonNegative = 0.0
 
@@ -163,7 +137,7 @@ class Odometry(Message):
     velocity_camera: Annotated[npt.NDArray[np.float64], Numbers((6,))]
     pose_covariance: _Covariance
     velocity_covariance: _Covariance
-    state: Annotated[PoseState, Choice(PoseState)]
+    state: Annotated[TrackingState, Choice(TrackingState)]
     epoch: Count
 
 

@@ -1,4 +1,4 @@
-"""Messages of sensors: frames in the ring, frames from another host, poses measured elsewhere, credit."""
+"""Messages of sensors: frames in the ring, frames from another host, credit."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.messages.base import (
     CAMERA,
@@ -18,10 +19,11 @@ from vtslam.common.messages.base import (
     NonNegative,
     OptionalId,
     Pixels,
-    Pose,
     Side,
 )
-from vtslam.common.messages.rules import COVARIANCE, Choice
+from vtslam.common.messages.rules import COVARIANCE, POSE, Choice, Fields, Maybe
+
+_PRIOR = Maybe(Fields(ExternalPose, {"T_world_camera": POSE, "covariance": COVARIANCE}))
 
 
 class FrameCondition(StrEnum):
@@ -76,13 +78,15 @@ class FramePixels(Message):
         camera: Intrinsics of both images, pixel centres at half-integers.
         rgb: uint8 [H,W,3], red first.
         depth: uint16 [H,W]; 0 means no depth.
+        pose_prior: Where another sensor says the camera was, or None. It comes with the frame, so that a frame that is
+            sent again has the same.
 
     Raises:
         ValueError: The images have more pixels than allowed.
     """
 
     KIND: ClassVar[str] = "frame_pixels"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     stream: Name
     frame_id: Count
@@ -91,31 +95,12 @@ class FramePixels(Message):
     camera: Annotated[Camera, CAMERA]
     rgb: Annotated[npt.NDArray[np.uint8], Pixels("u1", 3)]
     depth: Annotated[npt.NDArray[np.uint16], Pixels("<u2")]
+    pose_prior: Annotated[ExternalPose | None, _PRIOR] = None
 
     def __post_init__(self) -> None:
         pixels = self.camera.width * self.camera.height
         if pixels > MAX_PIXELS:
             raise ValueError(f"images of {pixels} pixels, at most {MAX_PIXELS} are taken")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PosePrior(Message):
-    """A pose that another sensor measured.
-
-    Attributes:
-        capture_time_ns: When it was measured, on the clock of the frames.
-        frame_id: The frame it belongs to; -1 if it is to be found by time.
-        T_world_camera: float64 [4,4].
-        covariance: float64 [6,6] of a left twist on ``T_camera_world`` (translation m, rotation rad).
-    """
-
-    KIND: ClassVar[str] = "pose_prior"
-    VERSION: ClassVar[int] = 1
-
-    capture_time_ns: Count
-    frame_id: OptionalId
-    T_world_camera: Pose
-    covariance: Annotated[npt.NDArray[np.float64], COVARIANCE]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,7 +19,7 @@ from vtslam.common.shm.process_identity import is_alive, own_identity, pid_of
 
 PAGE_BYTES = mmap.PAGESIZE
 CONTROL_BYTES = PAGE_BYTES
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 MAX_PINS = 24
 
 _MAGIC = int.from_bytes(b"VTSLSHM1", "little")
@@ -81,13 +81,13 @@ def make_file(path: Path, size_bytes: int) -> int:
     try:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise _refused(path, error, size_bytes) from error
+        raise refusal_of(path, error, size_bytes) from error
     try:
         os.ftruncate(fd, size_bytes)
     except OSError as error:
         os.close(fd)
         path.unlink()
-        raise _refused(path, error, size_bytes) from error
+        raise refusal_of(path, error, size_bytes) from error
     return fd
 
 
@@ -108,7 +108,7 @@ def reserve(path: Path, fd: int, offset: int, length: int) -> None:
     try:
         os.posix_fallocate(fd, offset, length)
     except OSError as error:
-        raise _refused(path, error, length) from error
+        raise refusal_of(path, error, length) from error
 
 
 def mapped(fd: int, length: int, *, offset: int = 0, writable: bool) -> npt.NDArray[np.uint8]:
@@ -134,7 +134,8 @@ def used_bytes(path: Path) -> int:
         return 0
 
 
-def _refused(path: Path, error: OSError, wanted_bytes: int) -> SharedMemoryError:
+def refusal_of(path: Path, error: OSError, wanted_bytes: int) -> SharedMemoryError:
+    """What an error of the file system comes to; SharedMemoryFull if it has no space."""
     if error.errno in _NO_SPACE:
         free = shutil.disk_usage(path.parent).free
         return SharedMemoryFull(str(path), wanted_bytes=wanted_bytes, free_bytes=free)

@@ -292,16 +292,13 @@ class FrameRingReader(_Ring):
         self._require(descriptor)
         slot = descriptor.slot
         rgb, depth = self._area.rgb(slot).copy(), self._area.depth(slot).copy()
-        try:
-            facts = self._area.facts(slot)
-        except ValueError as error:
-            raise self._gone(descriptor) from error
+        facts = self._area.facts(slot)
         fence()
         self._require(descriptor)
-        return Frame(rgb=rgb, depth=depth, **facts)
+        return Frame(rgb=rgb, depth=depth, **facts.of_frame())
 
     def _frame(self, slot: int) -> Frame:
-        return Frame(rgb=self._area.rgb(slot), depth=self._area.depth(slot), **self._area.facts(slot))
+        return Frame(rgb=self._area.rgb(slot), depth=self._area.depth(slot), **self._area.facts(slot).of_frame())
 
     def _check(self, descriptor: FrameDescriptor) -> None:
         if not (0 <= descriptor.slot < self.spec.slots and 1 <= descriptor.sequence < 2**40):

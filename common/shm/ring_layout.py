@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.shm._atomics import Words
@@ -15,7 +16,9 @@ from vtslam.common.shm.blocks import CONTROL_BYTES, MAX_PINS, PAGE_BYTES, Contro
 
 DESCRIPTION = np.dtype([("width", "<u4"), ("height", "<u4"), ("slots", "<u4"), ("pins", "<u4")])
 MAX_SLOTS = 256
-_WORDS_PER_SLOT = 16
+_WORDS_PER_SLOT = 64
+_FACTS, _PRIOR = slice(1, 9), slice(9, 61)  # words of a slot after the first; the last of the facts: has a prior
+_FACTS_FORMAT, _PRIOR_FORMAT = struct.Struct("<qq5dQ"), struct.Struct("<52d")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,16 +114,42 @@ class RingArea:
         return column(self._data, offset, np.uint16, (self.spec.height, self.spec.width))
 
     def write_facts(self, slot: int, frame: Frame) -> None:
-        """Store slot words 1 to 7."""
-        camera = frame.camera
+        """Store slot words 1 to 60."""
+        camera, prior = frame.camera, frame.pose_prior
         reals = (frame.depth_scale_m, camera.fx, camera.fy, camera.cx, camera.cy)
-        packed = struct.pack("<qq5d", frame.frame_id, frame.capture_time_ns, *reals)
-        for index, word in enumerate(struct.unpack("<7Q", packed), start=1):
+        packed = _FACTS_FORMAT.pack(frame.frame_id, frame.capture_time_ns, *reals, prior is not None)
+        self._store(slot, _FACTS, packed)
+        if prior is not None:
+            self._store(slot, _PRIOR, _PRIOR_FORMAT.pack(*prior.T_world_camera.ravel(), *prior.covariance.ravel()))
+
+    def facts(self, slot: int) -> "SlotFacts":
+        """Slot words 1 to 60, not looked at yet: they may be half written."""
+        return SlotFacts(self.spec, self._load(slot, _FACTS), self._load(slot, _PRIOR))
+
+    def _store(self, slot: int, words: slice, packed: bytes) -> None:
+        for index, word in enumerate(struct.unpack(f"<{len(packed) // 8}Q", packed), start=words.start):
             self._words.store(slot * _WORDS_PER_SLOT + index, word)
 
-    def facts(self, slot: int) -> dict[str, Any]:
-        """What a frame is besides its images, by the names of `Frame`; ValueError if it is no camera."""
-        words = (self._words.load(slot * _WORDS_PER_SLOT + index) for index in range(1, 8))
-        frame_id, time_ns, scale, fx, fy, cx, cy = struct.unpack("<qq5d", struct.pack("<7Q", *words))
+    def _load(self, slot: int, words: slice) -> bytes:
+        indices = range(words.start, words.stop)
+        return struct.pack(f"<{len(indices)}Q", *(self._words.load(slot * _WORDS_PER_SLOT + i) for i in indices))
+
+
+@dataclass(frozen=True, slots=True)
+class SlotFacts:
+    """What a frame in a slot is besides its images, as it was read."""
+
+    spec: RingSpec
+    packed: bytes
+    packed_prior: bytes
+
+    def of_frame(self) -> dict[str, Any]:
+        """By the names of `Frame`; only once it is certain that nobody wrote meanwhile."""
+        frame_id, time_ns, scale, fx, fy, cx, cy, has_prior = _FACTS_FORMAT.unpack(self.packed)
         camera = Camera(width=self.spec.width, height=self.spec.height, fx=fx, fy=fy, cx=cx, cy=cy)
-        return {"frame_id": frame_id, "capture_time_ns": time_ns, "depth_scale_m": scale, "camera": camera}
+        prior = None
+        if has_prior:
+            reals = np.array(_PRIOR_FORMAT.unpack(self.packed_prior))
+            prior = ExternalPose(T_world_camera=reals[:16].reshape(4, 4), covariance=reals[16:].reshape(6, 6))
+        facts = {"frame_id": frame_id, "capture_time_ns": time_ns, "depth_scale_m": scale}
+        return {**facts, "camera": camera, "pose_prior": prior}

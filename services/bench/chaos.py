@@ -5,7 +5,7 @@ import random
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,8 +13,10 @@ from typing import Any
 
 from vtslam.common import failpoints
 from vtslam.common.fleet_folder import SHARED_MEMORY
+from vtslam.services.bench.supervisor_kill import seconds_after_supervisor_kill
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.run_plan import RunPlan
+from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.supervisor import Supervisor
 from vtslam.storage.run_folder import RunFolder
@@ -48,8 +50,8 @@ class _Disturber:
         on_frame: Called after each frame.
         rng: Draws how long after its frame a signal is sent, so that it meets any part of the work.
         sent: Signals sent, by (service, signal).
-        deaths, hangs: By service, as the supervisor counts them.
         pids: All processes seen.
+        children: The processes as their supervisor sees them.
         frames: Frames committed.
     """
 
@@ -58,9 +60,8 @@ class _Disturber:
     on_frame: Callable[[FrameFacts], None]
     rng: random.Random
     sent: Counter[tuple[str, signal.Signals]] = field(default_factory=Counter)
-    deaths: dict[str, int] = field(default_factory=dict)
-    hangs: dict[str, int] = field(default_factory=dict)
     pids: set[int] = field(default_factory=set)
+    children: Mapping[str, ChildProcess] = field(default_factory=dict)
     frames: int = 0
     _stopped: list[_Stopped] = field(default_factory=list)
     _due_s: float | None = None
@@ -77,8 +78,8 @@ class _Disturber:
         self.on_frame(facts)
 
     def _step(self, supervisor: Supervisor) -> None:
-        for name, child in supervisor.children.items():
-            self.deaths[name], self.hangs[name] = child.deaths, child.hangs
+        self.children = supervisor.children
+        for child in supervisor.children.values():
             if child.pid is not None:
                 self.pids.add(child.pid)
         self._wake_stopped(supervisor)
@@ -115,7 +116,7 @@ class _Disturber:
 def bench_chaos(
     plan: RunPlan, *, kills: int, hangs: int, seed: int, on_frame: Callable[[FrameFacts], None]
 ) -> dict[str, Any]:
-    """Run a recording in one process, then in a fleet under fire, and compare.
+    """Run a recording in one process, then in a fleet under fire, and compare; at last kill a fleet's supervisor.
 
     Args:
         plan: The run.
@@ -132,8 +133,9 @@ def bench_chaos(
         plan.execute_in_fleet(disturbed, disturber.hooks())
         counts = _frame_counts(disturbed)
         identical = _result_bytes(calm) == _result_bytes(disturbed)
+        gone_s = seconds_after_supervisor_kill(plan, Path(folder))
     sent_kills = {name: disturber.sent[name, signal.SIGKILL] for name in _SERVICES}
-    killed = {name: disturber.deaths[name] - disturber.hangs[name] for name in _SERVICES}
+    killed = {name: child.deaths - child.hangs for name, child in disturber.children.items()}
     return {
         "kills": sum(killed.values()),
         "kills_by_service": killed,
@@ -143,6 +145,7 @@ def bench_chaos(
         "frames_duplicated": sum(count - 1 for count in counts.values()),
         "identical": identical,
         "orphans": sum(Path(f"/proc/{pid}").exists() for pid in disturber.pids),
+        "gone_after_supervisor_kill_s": None if gone_s is None else round(gone_s, 3),
         "shm_left": len([name for name in set(os.listdir(SHARED_MEMORY)) - before if _is_ours(name)]),
     }
 
@@ -150,7 +153,8 @@ def bench_chaos(
 def is_sound(values: dict[str, Any]) -> bool:
     """Whether nothing was lost, doubled, changed or left."""
     none = ("frames_missing", "frames_duplicated", "orphans", "shm_left")
-    return values["identical"] is True and all(values[key] == 0 for key in none)
+    died_with_supervisor = values["gone_after_supervisor_kill_s"] is not None
+    return died_with_supervisor and values["identical"] is True and all(values[key] == 0 for key in none)
 
 
 def _events(frames: int, kills: int, hangs: int, seed: int) -> list[tuple[int, str, signal.Signals]]:

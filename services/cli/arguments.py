@@ -67,7 +67,7 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument(
         "--in-process",
         action="store_true",
-        help="one process for all services; the result is the same",
+        help="one process for all services; the result is that of lockstep",
     )
     command.add_argument("--out", type=Path, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
@@ -77,6 +77,7 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         metavar="RUN",
         help="go on with a run that was cut off or stopped, with its own source and settings",
     )
+    _add_pacing(command, default="lockstep")
     _add_layers(command)
     _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
@@ -92,6 +93,9 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    _add_pacing(command, default="realtime")
+    command.add_argument("--listen", metavar="HOST:PORT", help="let other hosts in here; needs --access")
+    command.add_argument("--access", type=Path, metavar="FILE", help="who may come in (TOML, see deploy/runbook.md)")
     _add_layers(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
@@ -105,6 +109,8 @@ def _add_publish(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--connect", metavar="HOST:PORT", help="a fleet on another host; needs --credentials")
+    command.add_argument("--credentials", type=Path, metavar="FILE", help="login or certificate (TOML)")
     command.add_argument("--size", metavar="WxH", help="scale frames to this size")
     command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
 
@@ -161,7 +167,20 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
     basin = kinds.add_parser("basin", help="how far off a first guess of the pose may be, for both optimisers")
     basin.add_argument("--trials", type=int, default=30, metavar="N", help="guesses per error (default: %(default)s)")
-    fleet = kinds.add_parser("fleet", help="a run as processes, beside the same in one process")
+    fleet = kinds.add_parser("fleet", help="a run as processes, beside the same in one process; delays in realtime")
+    fleet.add_argument("--rounds", type=int, default=1, metavar="N", help="runs of each kind (default: %(default)s)")
+    fleet.add_argument(
+        "--parts", default="ratios,latency,realtime", metavar="A,B", help="what is measured (default: %(default)s)"
+    )
+    fleet.add_argument(
+        "--live-seconds", type=float, default=60.0, metavar="S", help="of latency and realtime (default: %(default)g)"
+    )
+    fleet.add_argument(
+        "--latency-size", default="1200x680", metavar="WxH", help="frames of latency, at 30 Hz (default: %(default)s)"
+    )
+    fleet.add_argument(
+        "--live-size", default="320x240", metavar="WxH", help="frames of realtime, at 60 Hz (default: %(default)s)"
+    )
     chaos = kinds.add_parser("chaos", help="a fleet whose processes are killed and stopped: is the result the same?")
     chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
     chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
@@ -204,6 +223,19 @@ def _add_source_shorthands(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only (source.frames)")
     command.add_argument(
         "--holdout", type=int, metavar="K", help="track every K-th regular frame but keep it out of mapping (holdout)"
+    )
+
+
+def _add_pacing(command: argparse.ArgumentParser, *, default: str) -> None:
+    command.add_argument(
+        "--pacing",
+        dest="assignments",
+        action="append",
+        default=[],
+        type=lambda text: f'fleet.pacing="{text}"',
+        metavar="P",
+        help="lockstep: every frame, one after another; pipelined: the next is tracked while one is mapped; realtime: "
+        f"the newest, others are dropped (fleet.pacing; default: {default})",
     )
 
 

@@ -9,7 +9,7 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
 from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
-from vtslam.services.bench.fleet import bench_fleet
+from vtslam.services.bench.fleet import PARTS, FleetBench, bench_fleet
 from vtslam.services.bench.overlap import HEADS, bench_overlap
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
@@ -18,7 +18,7 @@ from vtslam.services.cli.run_command import assignments_of
 from vtslam.services.run_plan import RunPlan, plan_run
 
 _LARGEST_SIDE_PX = 16384
-_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system, "fleet": bench_fleet}
+_OF_RECORDINGS = {"track": bench_track, "map": bench_map, "system": bench_system}
 
 
 def bench_command(args: Namespace) -> int:
@@ -37,7 +37,8 @@ def bench_command(args: Namespace) -> int:
 
 
 def _measured(args: Namespace) -> dict[str, object]:
-    return {"splat": _splat, "basin": _basin, "chaos": _chaos, "overlap": _overlap}.get(args.bench, _recording)(args)
+    kinds = {"splat": _splat, "basin": _basin, "chaos": _chaos, "fleet": _fleet, "overlap": _overlap}
+    return kinds.get(args.bench, _recording)(args)
 
 
 def _splat(args: Namespace) -> dict[str, object]:
@@ -73,6 +74,19 @@ def _chaos(args: Namespace) -> dict[str, object]:
         return bench_chaos(
             plan, kills=args.kills, hangs=args.hangs, seed=args.seed, on_frame=lambda facts: progress.step()
         )
+
+
+def _fleet(args: Namespace) -> dict[str, object]:
+    parts = args.parts.split(",")
+    if args.rounds < 1 or args.live_seconds <= 0.0 or not set(parts) <= set(PARTS):
+        raise ConfigError(
+            f"bench fleet: expected --rounds of at least 1, --live-seconds above 0 and --parts of {','.join(PARTS)}, "
+            f"found {args.rounds}, {args.live_seconds:g}, {args.parts}"
+        )
+    bench = FleetBench(
+        rounds=args.rounds, live_seconds=args.live_seconds, live_sizes=(_size(args.latency_size), _size(args.live_size))
+    )
+    return bench_fleet(_plan(args), parts, bench, on_part=lambda text: print(f"bench fleet: {text}", file=sys.stderr))
 
 
 def _recording(args: Namespace) -> dict[str, object]:

@@ -3,10 +3,13 @@
 from argparse import Namespace
 from dataclasses import asdict
 
+from vtslam.common.bus import Bus
+from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.run_command import summary_text
 from vtslam.services.cli.stop_request import StopRequest
+from vtslam.services.network import Door, join_from_elsewhere, read_door
 from vtslam.services.sensor.publisher import FramePublisher
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.fleet_run import FleetHooks
@@ -15,7 +18,7 @@ from vtslam.services.supervisor.live_run import run_live
 
 def up_command(args: Namespace) -> int:
     """Run a fleet until Ctrl-C or SIGTERM, which is its normal end; the exit status."""
-    console = Console(args.json)
+    console, door = Console(args.json), _door(args)
     console.print(
         f"fleet {args.fleet}: send frames with  vtslam publish SOURCE --fleet {args.fleet}   (Ctrl-C ends it)"
     )
@@ -29,6 +32,7 @@ def up_command(args: Namespace) -> int:
             config=args.config,
             assignments=args.assignments,
             overwrite=args.overwrite,
+            door=door,
         )
     console.print(f"{summary_text(summary)}\nrun folder: {args.out}")
     console.result({"run": str(args.out.resolve()), **asdict(summary)})
@@ -39,8 +43,23 @@ def publish_command(args: Namespace) -> int:
     """Send a recording to a fleet; 0 once all of it is in the map."""
     options = {"size": args.size, "range": args.frames}
     source = open_source(args.source, overrides={key: value for key, value in options.items() if value})
-    with Progress(len(source), what="publishing", unit="frame") as progress, FramePublisher(args.fleet) as publisher:
+    with Progress(len(source), what="publishing", unit="frame") as progress, FramePublisher(_fleet(args)) as publisher:
         for index in range(len(source)):
             publisher.publish(source.frame(index))
             progress.step()
     return 0
+
+
+def _door(args: Namespace) -> Door | None:
+    if (args.listen is None) != (args.access is None):
+        raise ConfigError("--listen HOST:PORT needs --access FILE, which says who may come in, and the other way round")
+    return None if args.listen is None else read_door(args.listen, args.access)
+
+
+def _fleet(args: Namespace) -> str | Bus:
+    """The name of a fleet on this host, or a session with one elsewhere."""
+    if (args.connect is None) != (args.credentials is None):
+        raise ConfigError("--connect HOST:PORT needs --credentials FILE, and the other way round")
+    if args.connect is None:
+        return str(args.fleet)
+    return join_from_elsewhere(args.fleet, args.connect, args.credentials)

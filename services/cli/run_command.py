@@ -9,6 +9,7 @@ from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
+from vtslam.services.pacing import Pacing
 from vtslam.services.run_plan import RunPlan, plan_resume, plan_run
 from vtslam.services.run_record import RunSummary
 from vtslam.storage.errors import WriteFailed
@@ -19,6 +20,9 @@ def run_command(args: Namespace) -> int:
     console = Console(args.json)
     out = _checked_out(args)
     plan = plan_resume(out) if args.resume else _plan(args)
+    pacing = plan.settings.fleet.pacing
+    if args.in_process and pacing not in ("", Pacing.LOCKSTEP):
+        raise ConfigError(f"--in-process works in lockstep, expected no other pacing, found {pacing}")
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
         try:

@@ -15,7 +15,7 @@ from vtslam.common.settings import MapperSettings
 from vtslam.common.splat.engine import Engine, Gradients, Splats
 from vtslam.services.mapper.state import Moments, TrainingView
 
-_RECENT_STEPS = 4
+_RECENT_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,19 +10,21 @@ from vtslam.common.messages import FrameCommitted, SectionSealed, ServiceState, 
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.shm.active_writer import ActiveWriter
-from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
+from vtslam.common.shm.errors import FrameGone, MapStoreFull, SharedMemoryFull
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.shm.map_store import MapStore
 from vtslam.common.shm.records import ActiveSpec, Commit
 from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.shm.sealed_block import sealed_bytes
 from vtslam.common.splat.engine import Engine
-from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED, TRACKER_POSE
+from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED
 from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.frame_facts import FIRST_FRAME_STATE, CommittedFrame, Seconds, frame_facts
 from vtslam.services.frame_journal import JournalWriter
+from vtslam.services.mapper.pose_intake import EveryPose, NewestPose, PoseIntake
 from vtslam.services.mapper.state import ActiveSection, CommitRecord
 from vtslam.services.mapper.turns import MapperTurns
+from vtslam.services.pacing import Pace
 from vtslam.services.section_map import ReadsSections, SectionMap
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 from vtslam.services.shared_sections import active_section_of, commit_of
@@ -63,6 +65,7 @@ class MapperService:
         store: The map store.
         archive: Where sealed sections come from.
         paths: Ring and journal.
+        pace: Which poses are mapped, and how many commits trackers look back.
     """
 
     def __init__(
@@ -74,21 +77,23 @@ class MapperService:
         store: MapStore,
         archive: ReadsSections,
         paths: FleetPaths,
+        pace: Pace,
     ) -> None:
         self._clock, self._link, self._settings, self._store = bus.clock, link, settings, store
-        self._archive, self._paths = archive, paths
+        self._archive, self._paths, self._pace = archive, paths, pace
         self._map = SectionMap(archive, candidate_interval=settings.section.candidate_interval)
         self._turns = MapperTurns(settings, engine, self._map)
         self._journal = JournalWriter(paths.journal)
-        self._tracked = bus.subscriber(TRACKER_POSE)
+        length = settings.section.length
+        self._intake: PoseIntake = NewestPose(bus, section_length=length) if pace.is_realtime else EveryPose(bus)
         self._committed = bus.publisher(MAPPER_COMMITTED)
         self._sealed = bus.publisher(SECTION_SEALED)
         self._ring: FrameRingReader | None = None
-        self._poses: dict[int, TrackedPose] = {}
         self._active: ActiveSection | None = None
         self._facts: CommitFacts | None = None
         self._writer: ActiveWriter | None = None
         self._mapped: _Mapped | None = None
+        self._untold: CommitFacts | None = None  # committed, but there was no room in the journal
         self._ended: tuple[Section, int, CommitFacts] | None = None  # section, renders and facts; not sealed yet
         self._no_room_since_ns: int | None = None
         self._take_over()
@@ -96,23 +101,25 @@ class MapperService:
     def step(self) -> float | None:
         """See `Steps`."""
         self._link.poll()
-        self._listen()
+        self._intake.listen(self._num_frames, 0 if self._facts is None else self._facts.sequence)
         if self._link.stopping:
             self._end()
             return None
+        if self._untold is not None:
+            return self._announce(self._untold)
         if self._mapped is not None:
             return self._commit(self._mapped)
         if self._active is not None and self._section_ends(self._active):
             return self._seal(self._active)
-        pose = self._poses.pop(self._num_frames, None)
+        pose = self._intake.take(self._num_frames)
         if pose is not None:
-            self._link.tell(ServiceState.WORKING, self._num_frames - 1)
-            self._mapped = self._map_frame(pose)
+            self._link.tell(ServiceState.WORKING, self._last_frame_id)
+            self._mapped = self._map_pose(pose)
             return 0.0
         if self._is_drained():
             self._end()
             return None
-        self._link.tell(ServiceState.READY, self._num_frames - 1)
+        self._link.tell(ServiceState.READY, self._last_frame_id)
         return HEARTBEAT_S
 
     @property
@@ -120,21 +127,19 @@ class MapperService:
         """Frames committed."""
         return 0 if self._facts is None else self._facts.num_frames
 
+    @property
+    def _last_frame_id(self) -> int:
+        return -1 if self._facts is None else self._facts.frame.facts.frame_id
+
     def _end(self) -> None:
         self._journal.close()
-        self._link.tell(ServiceState.FINISHED, self._num_frames - 1)
+        self._link.tell(ServiceState.FINISHED, self._last_frame_id)
 
     def _is_drained(self) -> bool:
-        through = self._link.drain_through
-        return through is not None and self._num_frames > through
+        return self._intake.is_drained(self._num_frames, self._link.drain_through)
 
     def _section_ends(self, active: ActiveSection) -> bool:
         return len(active.section.frames) == self._settings.section.length or self._is_drained()
-
-    def _listen(self) -> None:
-        while (tracked := self._tracked.receive()) is not None:
-            if tracked.message.frame_id >= self._num_frames:
-                self._poses[tracked.message.frame_id] = tracked.message
 
     # --- taking over ------------------------------------------------------------------------------------------------
 
@@ -154,10 +159,20 @@ class MapperService:
 
     # --- one frame --------------------------------------------------------------------------------------------------
 
-    def _map_frame(self, pose: TrackedPose) -> _Mapped:
+    def _map_pose(self, pose: TrackedPose) -> _Mapped | None:
+        """Map a frame; None if the ring has it no more, which only happens where poses may be skipped."""
+        try:
+            frame = self._open_ring().copied(FrameDescriptor(slot=pose.slot, sequence=pose.slot_sequence))
+        except FrameGone:
+            if not self._intake.may_skip:
+                raise
+            self._link.count("frames.gone")
+            return None
+        return self._map_frame(frame, pose)
+
+    def _map_frame(self, frame: Frame, pose: TrackedPose) -> _Mapped:
         start_ns = self._clock.monotonic_ns()
         section_id, row = divmod(self._num_frames, self._settings.section.length)
-        frame = self._open_ring().copied(FrameDescriptor(slot=pose.slot, sequence=pose.slot_sequence))
         budget_s = self._settings.mapper.budget_s
         active, record = self._turns.map(
             frame,
@@ -190,6 +205,7 @@ class MapperService:
         )
         return CommitFacts(
             num_frames=self._num_frames + 1,
+            num_tracked=pose.num_tracked,
             sequence=pose.slot_sequence,
             iterations=record.iterations,
             frame=CommittedFrame(
@@ -211,9 +227,7 @@ class MapperService:
         self._active, self._facts = mapped.active, mapped.facts
         self._map.committed(mapped.active.section)
         self._link.count("frames.committed")
-        if not self._section_ends(mapped.active):
-            self._announce(mapped.facts)
-        return 0.0
+        return 0.0 if self._section_ends(mapped.active) else self._announce(mapped.facts)
 
     def _spec(self, section: Section) -> ActiveSpec:
         length, mapper = self._settings.section.length, self._settings.mapper
@@ -226,6 +240,7 @@ class MapperService:
             max_frames=length,
             max_gaussians=per_pixel * section.camera.width * section.camera.height * length,
             with_moments=mapper.keep_moments,
+            kept_generations=1 + self._pace.lead,
         )
 
     def _wait_for_room(self, error: MapStoreFull | SharedMemoryFull) -> float:
@@ -234,7 +249,7 @@ class MapperService:
         self._no_room_since_ns = self._no_room_since_ns or now_ns
         if not self._store.sealed_ids() or now_ns - self._no_room_since_ns > _GIVE_UP_S * 1e9:
             raise error
-        self._link.tell(ServiceState.DEGRADED, self._num_frames - 1, detail=str(error))
+        self._link.tell(ServiceState.DEGRADED, self._last_frame_id, detail=str(error))
         return _NO_ROOM_S
 
     # --- the end of a section ---------------------------------------------------------------------------------------
@@ -265,8 +280,7 @@ class MapperService:
                 epoch=self._link.epoch,
             )
         )
-        self._announce(facts)
-        return 0.0
+        return self._announce(facts)
 
     def _end_of(self, active: ActiveSection) -> tuple[Section, int, CommitFacts]:
         assert self._facts is not None
@@ -277,9 +291,14 @@ class MapperService:
 
     # --- telling others ---------------------------------------------------------------------------------------------
 
-    def _announce(self, facts: CommitFacts) -> None:
+    def _announce(self, facts: CommitFacts) -> float:
         """Tell of the last commit; harmless if that was done before."""
-        self._journal.append(facts, section_ended=self._active is None)
+        self._untold = facts
+        try:
+            self._journal.append(facts, section_ended=self._active is None)
+        except SharedMemoryFull as error:
+            return self._wait_for_room(error)
+        self._untold = self._no_room_since_ns = None
         if self._paths.ring.exists():  # when a run is resumed, it is made later, and made so that this holds
             self._open_ring().acknowledge(facts.sequence)
         frame, about = facts.frame, facts.frame.facts
@@ -302,6 +321,7 @@ class MapperService:
                 epoch=self._link.epoch,
             )
         )
+        return 0.0
 
     def _open_ring(self) -> FrameRingReader:
         self._ring = self._ring or FrameRingReader(self._paths.ring)

@@ -1,14 +1,15 @@
 """The sensor service of a live fleet: frames that a publisher sends over the bus, into the ring; credit back."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
-from vtslam.common.messages import Credit, FrameDescriptor, FramePixels, ServiceState
+from vtslam.common.messages import Credit, FrameCondition, FramePixels, ServiceState
 from vtslam.common.shm.frame_ring import FrameRingReader, FrameRingWriter
 from vtslam.common.shm.ring_layout import FrameDescriptor as RingDescriptor
 from vtslam.common.topics import MAPPER_COMMITTED, SENSOR_CREDIT, SENSOR_FRAME, SENSOR_PIXELS
-from vtslam.services.sensor.ring import CREDIT, make_ring
+from vtslam.services.sensor.ring import descriptor_message, make_ring
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 
 WINDOW = 4  # frames a publisher may have under way
@@ -19,16 +20,20 @@ class LiveSensor:
 
     The fleet numbers its frames from 0, and says in its credit which number it wants next; a publisher counts from
     there. A publisher keeps what is not committed, so a sensor that starts again gets it again. Frames of other
-    numbers, of another camera or scale than the first one's, are refused and counted.
+    numbers, of another camera or scale than the first one's, are refused and counted. Times that do not increase are
+    counted too, and taken for the nanosecond after the one before.
+
+    Without a credit (realtime) a frame in the ring is done with for its publisher, whatever becomes of it there.
 
     Args:
         bus: Its session.
         link: What it says of itself and is told.
         ring_path: Where the ring is, or will be once the first frame came.
+        credit: Frames that may be in the ring without being committed; None in realtime, where the oldest one goes.
     """
 
-    def __init__(self, bus: Bus, link: ServiceLink, ring_path: Path) -> None:
-        self._clock, self._link, self._ring_path = bus.clock, link, ring_path
+    def __init__(self, bus: Bus, link: ServiceLink, ring_path: Path, *, credit: int | None = 2) -> None:
+        self._clock, self._link, self._ring_path, self._credit_frames = bus.clock, link, ring_path, credit
         self._pixels = bus.subscriber(SENSOR_PIXELS)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
         self._frames = bus.publisher(SENSOR_FRAME)
@@ -36,7 +41,7 @@ class LiveSensor:
         self._told: tuple[int, int] | None = None
         self._told_ns = 0
         self._pending: FramePixels | None = None
-        self._like: Frame | None = None  # has the camera and scale of all frames
+        self._last: Frame | None = None  # has the camera and scale of all frames
         self._ring = FrameRingWriter.adopt(ring_path) if ring_path.exists() else None
         if self._ring is not None:
             self._announce_again(FrameRingReader(ring_path))
@@ -70,30 +75,45 @@ class LiveSensor:
         if not self._is_wanted(pixels):
             self._pending = None
             return True
-        frame = _frame_of(pixels)
+        frame, condition = self._in_time(_frame_of(pixels))
         if self._ring is None:
-            self._ring = make_ring(self._ring_path, frame.camera)
-        descriptor = self._ring.try_publish(frame, credit=CREDIT)
+            self._ring = make_ring(self._ring_path, frame.camera, credit=self._credit_frames)
+        descriptor = self._published(self._ring, frame)
         if descriptor is None:
             return False
-        self._pending, self._like = None, self._like or frame
-        self._announce(frame, descriptor)
-        self._link.count("frames.published")
+        self._pending, self._last = None, frame
+        self._announce(frame, descriptor, condition)
+        self._link.counters["frames.published"] = self._wanted
+        if condition is not FrameCondition.OK:
+            self._link.count(f"frames.{condition}")
         return True
+
+    def _published(self, ring: FrameRingWriter, frame: Frame) -> RingDescriptor | None:
+        if self._credit_frames is None:
+            return ring.publish_newest(frame)
+        return ring.try_publish(frame, credit=self._credit_frames)
 
     def _is_wanted(self, pixels: FramePixels) -> bool:
         if pixels.frame_id != self._wanted:
             self._link.count("frames.repeated" if pixels.frame_id < self._wanted else "frames.ahead")
             return False
-        like = self._like
-        if like is not None and (like.camera, like.depth_scale_m) != (pixels.camera, pixels.depth_scale_m):
+        last = self._last
+        if last is not None and (last.camera, last.depth_scale_m) != (pixels.camera, pixels.depth_scale_m):
             self._link.count("frames.other_camera")
             return False
         return True
 
+    def _in_time(self, frame: Frame) -> tuple[Frame, FrameCondition]:
+        """The frame at a time after the one before, as trajectories need it."""
+        if self._last is None or frame.capture_time_ns > self._last.capture_time_ns:
+            return frame, FrameCondition.OK
+        return replace(frame, capture_time_ns=self._last.capture_time_ns + 1), FrameCondition.CLOCK_JUMPED
+
     def _grant(self) -> None:
         """Say how far publishers may go, when that has changed and now and then."""
-        committed = -1 if self._ring is None else self._ring.acknowledged - 1
+        committed = self._wanted - 1
+        if self._ring is not None and self._credit_frames is not None:
+            committed = self._ring.acknowledged - 1
         now_ns = self._clock.monotonic_ns()
         if self._told == (committed, self._wanted) and now_ns - self._told_ns < HEARTBEAT_S * 1e9:
             return
@@ -111,23 +131,15 @@ class LiveSensor:
         """Frames that are not done with, of a sensor that died; any of the ring's frames says what they are like."""
         newest = reader.newest()
         if newest is not None:
-            self._like = reader.copied(newest)
+            self._last = reader.copied(newest)
         for descriptor in reader.unacknowledged():
             with reader.using(descriptor) as frame:
                 self._announce(frame, descriptor)
 
-    def _announce(self, frame: Frame, descriptor: RingDescriptor) -> None:
-        self._frames.publish(
-            FrameDescriptor(
-                frame_id=frame.frame_id,
-                capture_time_ns=frame.capture_time_ns,
-                slot=descriptor.slot,
-                slot_sequence=descriptor.sequence,
-                width=frame.camera.width,
-                height=frame.camera.height,
-                epoch=self._link.epoch,
-            )
-        )
+    def _announce(
+        self, frame: Frame, descriptor: RingDescriptor, condition: FrameCondition = FrameCondition.OK
+    ) -> None:
+        self._frames.publish(descriptor_message(frame, descriptor, epoch=self._link.epoch, condition=condition))
 
 
 def _frame_of(pixels: FramePixels) -> Frame:
@@ -138,4 +150,5 @@ def _frame_of(pixels: FramePixels) -> Frame:
         depth=pixels.depth,
         depth_scale_m=pixels.depth_scale_m,
         camera=pixels.camera,
+        pose_prior=pixels.pose_prior,
     )

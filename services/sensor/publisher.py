@@ -18,7 +18,10 @@ _FIRST_PATIENCE_S = 2.0  # without progress, until frames under way are sent aga
 
 
 class FramePublisher:
-    """Sends frames to a fleet, no faster than it maps them; a context manager that waits for the last one.
+    """Sends frames to a fleet, no faster than it takes them; a context manager that waits for the last one.
+
+    In lockstep a frame is taken once there is room for it beside those being mapped, in realtime at once; likewise the
+    last one is waited for until it is in the map, or only until it has arrived.
 
     Frames are numbered by the fleet; their own ``frame_id`` does not matter. What is not committed is kept, at most a
     few frames, and sent again if the fleet's sensor service was started again.
@@ -59,6 +62,7 @@ class FramePublisher:
             camera=frame.camera,
             rgb=frame.rgb.copy(),  # the caller's may change before it is sent again
             depth=frame.depth.copy(),
+            pose_prior=None if frame.pose_prior is None else frame.pose_prior.copied(),
         )
         self._kept[number] = pixels
         self._next += 1

@@ -18,6 +18,7 @@ from vtslam.common.fleet_folder import FleetFolder, read_owner
 if TYPE_CHECKING:
     from vtslam.common.bus import Bus, Steps
     from vtslam.common.settings import Settings
+    from vtslam.services.pacing import Pace
     from vtslam.services.service_link import ServiceLink
     from vtslam.storage.run_folder import RunFolder
 
@@ -35,6 +36,20 @@ class _Parts:
     run: "RunFolder"
     settings: "Settings"
     source: str
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames come from publishers."""
+        from vtslam.services.supervisor.processes import LIVE_SOURCE
+
+        return self.source == LIVE_SOURCE
+
+    @property
+    def pace(self) -> "Pace":
+        """The pace of the fleet."""
+        from vtslam.services.pacing import pace_of
+
+        return pace_of(self.settings.fleet, live=self.is_live)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -82,6 +97,7 @@ def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
         try:
             parts = _Parts(bus, link, folder, run, settings, info.facts.source)
             run_steps(_BUILDERS[name](parts), bus)
+            folder.write_counts(name, link.counters)
         except (SourceError, StorageError, MapStoreFull, SharedMemoryFull) as error:
             folder.write_failure(name, str(error))
             return REFUSED
@@ -90,22 +106,26 @@ def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
 
 def _sensor(parts: _Parts) -> "Steps":
     from vtslam.services.sensor.live import LiveSensor
+    from vtslam.services.sensor.replay import ReplaySensor
     from vtslam.services.sensor.service import RecordingSensor
     from vtslam.services.sensor.sources.registry import open_source
-    from vtslam.services.supervisor.processes import LIVE_SOURCE
 
-    if parts.source == LIVE_SOURCE:
-        return LiveSensor(parts.bus, parts.link, parts.folder.ring_path)
+    bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
+    if parts.is_live:
+        return LiveSensor(bus, link, ring_path, credit=None if pace.is_realtime else pace.credit)
+    source = open_source(parts.source)
+    if pace.is_realtime:
+        return ReplaySensor(bus, link, source, ring_path, rate_hz=pace.replay_hz)
     durable = parts.run.catalog.num_frames  # when the sensor starts for the first time, these are all
-    source, ring_path = open_source(parts.source), parts.folder.ring_path
-    return RecordingSensor(parts.bus, parts.link, source, ring_path, frames_before=durable)
+    return RecordingSensor(bus, link, source, ring_path, credit=pace.credit, frames_before=durable)
 
 
 def _tracker(parts: _Parts) -> "Steps":
-    from vtslam.services.engines import make_engine, thread_count
+    from vtslam.services.engines import make_engine, thread_count, with_threads
     from vtslam.services.map_follower import MapFollower, StoreArchive
     from vtslam.services.supervisor.store import map_store
     from vtslam.services.tracker.core import Tracker
+    from vtslam.services.tracker.realtime import RealtimeTracker
     from vtslam.services.tracker.service import TrackerService
     from vtslam.storage.section_convert import SectionArchive
 
@@ -115,19 +135,16 @@ def _tracker(parts: _Parts) -> "Steps":
         StoreArchive(store, SectionArchive(parts.run)),
         candidate_interval=settings.section.candidate_interval,
     )
-    threads, engine = thread_count(settings.splat), make_engine(settings.splat)
-    return TrackerService(
-        parts.bus,
-        parts.link,
-        Tracker(settings=settings.tracker, engine=engine, threads=threads),
-        follower,
-        parts.folder.ring_path,
-        section_length=settings.section.length,
-    )
+    splat, length = with_threads(settings.splat, settings.fleet.tracker_threads), settings.section.length
+    core = Tracker(settings=settings.tracker, engine=make_engine(splat), threads=thread_count(splat))
+    bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
+    if pace.is_realtime:
+        return RealtimeTracker(bus, link, core, follower, ring_path, section_length=length)
+    return TrackerService(bus, link, core, follower, ring_path, section_length=length, lead=pace.lead)
 
 
 def _mapper(parts: _Parts) -> "Steps":
-    from vtslam.services.engines import make_engine
+    from vtslam.services.engines import make_engine, with_threads
     from vtslam.services.map_follower import StoreArchive
     from vtslam.services.mapper.service import FleetPaths, MapperService
     from vtslam.services.supervisor.store import map_store
@@ -138,10 +155,11 @@ def _mapper(parts: _Parts) -> "Steps":
         parts.bus,
         parts.link,
         parts.settings,
-        make_engine(parts.settings.splat),
+        make_engine(with_threads(parts.settings.splat, parts.settings.fleet.mapper_threads)),
         store,
         StoreArchive(store, SectionArchive(parts.run)),
         FleetPaths(ring=parts.folder.ring_path, journal=parts.folder.journal_path),
+        parts.pace,
     )
 
 

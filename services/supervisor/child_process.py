@@ -42,6 +42,7 @@ class ChildProcess:
         self.status: ServiceStatus | None = None
         self.finished = False
         self.peak_rss_mb = 0.0
+        self._ended_counts: dict[str, int] | None = None
         self._popen: subprocess.Popen[bytes] | None = None
         self._start_at_s = 0.0
         self._heard_s = self._present_s = 0.0
@@ -51,6 +52,13 @@ class ChildProcess:
     def pid(self) -> int | None:
         """Its process, if it runs."""
         return None if self._popen is None else self._popen.pid
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What it has counted: in all once it has ended, which its last message may not tell; before, as it said."""
+        if self._ended_counts is not None:
+            return self._ended_counts
+        return {} if self.status is None else self.status.counters
 
     @property
     def is_ready(self) -> bool:
@@ -100,6 +108,7 @@ class ChildProcess:
         self._popen = None
         if code == 0:
             self.finished = True
+            self._ended_counts = self._folder.counts(self.process.name)
             return None
         if code == REFUSED:
             self.finished = True

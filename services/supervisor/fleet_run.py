@@ -14,11 +14,15 @@ from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
+from vtslam.services.network import Door
+from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.errors import FleetError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
+from vtslam.services.supervisor.processes import LIVE_SOURCE, PROCESSES
 from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
@@ -53,8 +57,9 @@ def run_in_fleet(
     resume: ResumePoint | None = None,
     fleet: str = "",
     base: Path = SHARED_MEMORY,
+    door: Door | None = None,
 ) -> RunSummary:
-    """Run the recording that ``run.toml`` names, each service a process of its own, in lockstep.
+    """Run the source that ``run.toml`` names, each service a process of its own.
 
     Args:
         run: A run folder, open for writing, empty unless ``resume`` is given; settings and source are read from its
@@ -64,10 +69,12 @@ def run_in_fleet(
         resume: Where to go on; from the beginning if None.
         fleet: Name of the fleet; one of its own unless given.
         base: Where the fleet's shared memory lies.
+        door: How it is opened to other hosts; closed unless given.
 
     Raises:
         SourceError: A frame cannot be read; what was done before it is kept.
-        FleetError: A process cannot be kept alive, or the port for metrics is taken; sections written so far are kept.
+        FleetError: A process cannot be kept alive, or the port for metrics is taken; the poses of all committed frames
+            and the sealed sections are kept.
         SharedMemoryError, BusError, PrivateFolderError: Shared memory or bus cannot be set up.
         StorageError: The run folder cannot be written.
     """
@@ -76,6 +83,8 @@ def run_in_fleet(
     fleet = fleet or f"run-{os.getpid()}-{secrets.token_hex(3)}"
     folder = FleetFolder.create(fleet, run_folder=str(run.path.resolve()), base=base)
     try:
+        for process in PROCESSES:
+            folder.reserve_failure(process.name)
         store, metrics = map_store(folder, settings), FleetMetrics()
 
         def on_frame(facts: FrameFacts) -> None:
@@ -90,30 +99,39 @@ def run_in_fleet(
             section = SectionArchive(run).read(resume.section_id)
             store.restore(section, resume.frame, resume.facts.packed())
         recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
-        with Hub(folder.path, fleet) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
+        access = None if door is None else door.access_of(folder.path)
+        with Hub(folder.path, fleet, access) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
             supervisor = Supervisor(
                 bus,
                 fleet=fleet,
                 folder=folder,
                 recorder=recorder,
                 hang_s=settings.fleet.hang_s,
+                pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,
                 on_event=on_event,
                 environment=hooks.environment,
             )
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
-                interrupted = _supervised(supervisor, bus, hooks)
-        children = supervisor.children.values()
+                try:
+                    interrupted = _supervised(supervisor, bus, hooks)
+                except FleetError:
+                    recorder.finish_broken(seconds=time.perf_counter() - start_s, peak_rss_mb=_peak_rss_mb(supervisor))
+                    raise
         summary = recorder.finish(
             finished=not interrupted and supervisor.refusal is None,
             interrupted=interrupted,
             seconds=time.perf_counter() - start_s,
-            peak_rss_mb=peak_rss_mb() + sum(child.peak_rss_mb for child in children),
+            peak_rss_mb=_peak_rss_mb(supervisor),
         )
     finally:
         folder.remove()
     if supervisor.refusal is not None:
         raise SourceError(str(supervisor.refusal))
     return summary
+
+
+def _peak_rss_mb(supervisor: Supervisor) -> float:
+    return peak_rss_mb() + sum(child.peak_rss_mb for child in supervisor.children.values())
 
 
 def _supervised(supervisor: Supervisor, bus: Bus, hooks: FleetHooks) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 from vtslam.common.config import to_dict
 from vtslam.common.preset_loading import load_settings
 from vtslam.services.engines import engine_versions, make_engine
+from vtslam.services.network import Door
 from vtslam.services.process_facts import program_version, versions
 from vtslam.services.run_record import RunSummary
 from vtslam.services.supervisor.fleet_run import FleetHooks, run_in_fleet
@@ -25,6 +26,7 @@ def run_live(
     config: Path | None = None,
     assignments: Sequence[str] = (),
     overwrite: bool = False,
+    door: Door | None = None,
 ) -> RunSummary:
     """Run a fleet until ``hooks.should_stop``, mapping every frame that publishers send.
 
@@ -37,6 +39,7 @@ def run_live(
         config: A user's TOML file, or None.
         assignments: ``key=value`` texts.
         overwrite: Give up an earlier run in ``out``.
+        door: How it is opened to other hosts; closed unless given.
 
     Raises:
         ConfigError: A setting is refused.
@@ -56,7 +59,7 @@ def run_live(
     )
     info = RunInfo(facts=facts, settings=to_dict(settings), versions={**versions(), **engine_versions(settings.splat)})
     with RunFolder.create(out, info, overwrite=overwrite) as run:
-        summary = run_in_fleet(run, settings, hooks, fleet=fleet)
+        summary = run_in_fleet(run, settings, hooks, fleet=fleet, door=door)
         _complete(run, summary)
     return replace(summary, interrupted=False)
 

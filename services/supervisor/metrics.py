@@ -74,8 +74,7 @@ def _counters(children: Mapping[str, ChildProcess]) -> list[tuple[str, int]]:
     return [
         (f'{{service="{name}",event="{event}"}}', count)
         for name, child in children.items()
-        if child.status is not None
-        for event, count in sorted(child.status.counters.items())
+        for event, count in sorted(child.counters.items())
     ]
 
 

@@ -3,10 +3,10 @@
 import contextlib
 from collections.abc import Callable
 
-from vtslam.common.shm.errors import SectionPinned
+from vtslam.common.shm.errors import SectionPinned, SharedMemoryError
 from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
-from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.frame_facts import CommittedFrame, FrameFacts
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.storage.run_folder import RunFolder
@@ -39,32 +39,52 @@ class Recorder:
         """Frames committed, as far as they were seen here."""
         return self._record.num_frames
 
-    def step(self) -> None:
-        """Take in what is new, and let sections that are on disk leave memory; raises StorageError."""
+    def step(self, *, make_room: bool = False) -> None:
+        """Take in what is new, and let sections that are on disk leave memory, all but one if ``make_room``.
+
+        Raises:
+            StorageError: The run folder cannot be written.
+        """
         self._take_frames()
-        self._archive()
+        self._archive(resident=1 if make_room else _RESIDENT_SECTIONS)
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
         """Write everything that is not written yet; see `RunRecord.finish`."""
         self.step()
         return self._record.finish(finished=finished, interrupted=interrupted, seconds=seconds, peak_rss_mb=peak_rss_mb)
 
+    def finish_broken(self, *, seconds: float, peak_rss_mb: float) -> None:
+        """Write what is known of a fleet that cannot go on; the frames of its open section are in no section file."""
+        self.step()
+        with contextlib.suppress(SharedMemoryError):  # which may be why the fleet cannot go on
+            last = self._store.last_commit()  # whoever committed it may have died before it wrote to the journal
+            if last is not None:
+                facts = CommitFacts.unpacked(last.facts)
+                self._take(facts.frame)
+                if last.is_sealed and last.section_id >= self._next_section:
+                    self._ended[last.section_id] = facts
+                    self._archive(resident=_RESIDENT_SECTIONS)
+        self._record.finish_broken(seconds=seconds, peak_rss_mb=peak_rss_mb)
+
     def _take_frames(self) -> None:
         for line in self._journal.new_lines():
-            frame = line.frame
-            is_new = frame.facts.frame_id >= self.num_frames
-            self._record.add(frame)
             if line.ended is not None:
-                self._ended[frame.facts.section_id] = line.ended
-            if is_new:
-                self._on_frame(frame.facts)
+                self._ended[line.frame.facts.section_id] = line.ended
+            self._take(line.frame)
 
-    def _archive(self) -> None:
+    def _take(self, frame: CommittedFrame) -> None:
+        is_new = frame.facts.frame_id > self._record.last_frame_id
+        self._record.add(frame)
+        if is_new:
+            self._on_frame(frame.facts)
+
+    def _archive(self, *, resident: int) -> None:
         while self._next_section in self._ended:
             self._write(self._next_section)
             self._next_section += 1
             self._journal.forget_before(self._next_section)
-        for section_id in self._store.sealed_ids()[:-_RESIDENT_SECTIONS]:
+        sealed = self._store.sealed_ids()
+        for section_id in sealed[: max(len(sealed) - resident, 0)]:
             if section_id < self._next_section:
                 with contextlib.suppress(SectionPinned):
                     self._store.unlink_sealed(section_id, verified_on_disk=True)

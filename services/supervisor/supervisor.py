@@ -5,10 +5,11 @@ from enum import Enum
 
 from vtslam.common.bus import Bus
 from vtslam.common.fleet_folder import FleetFolder
-from vtslam.common.messages import Command, Control, ServiceState
+from vtslam.common.messages import Command, Control, ServiceState, ServiceStatus
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.topics import CONTROL, EVERY_SERVICE, MAPPER_COMMITTED, STATUS
+from vtslam.services.pacing import Pacing
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import ProcessRefused
@@ -24,8 +25,8 @@ class _Phase(Enum):
     """How far the fleet is with ending; each begins when a process has come to its end."""
 
     RUNNING = "running"
-    MAPPING_REST = "mapping the rest"  # the sensor has ended
-    TRACKER_STOPPING = "stopping the tracker"  # the mapper has ended
+    FINISHING = "finishing the rest"  # the sensor has ended
+    LAST_ENDING = "ending"  # and so has the second of the other two
     ENDED = "ended"
 
 
@@ -38,6 +39,7 @@ class Supervisor:
         folder: The fleet's folder.
         recorder: Writes the run folder.
         hang_s: Silence of a work loop that is a hang.
+        pacing: Who waits for whom; decides who ends after whom.
         on_event: Told, in words, of what the user should know.
         environment: Variables for a process, for tests and experiments.
 
@@ -53,10 +55,11 @@ class Supervisor:
         folder: FleetFolder,
         recorder: Recorder,
         hang_s: float,
+        pacing: Pacing = Pacing.LOCKSTEP,
         on_event: Callable[[str], None] = lambda text: None,
         environment: Environment = lambda name, epoch: {},
     ) -> None:
-        self._bus, self._folder, self._recorder = bus, folder, recorder
+        self._bus, self._folder, self._recorder, self._pacing = bus, folder, recorder, pacing
         self._on_event, self._environment = on_event, environment
         self._children = {
             process.name: ChildProcess(process, fleet=fleet, folder=folder, hang_s=hang_s) for process in PROCESSES
@@ -67,6 +70,7 @@ class Supervisor:
         self._commits = bus.subscriber(MAPPER_COMMITTED, newest_only=True)
         self._orders = {name: bus.publisher(CONTROL, service=name) for name in self._children}
         self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
+        self._told: set[str] = set()  # processes that were said to wait
         self._phase = _Phase.RUNNING
         self.refusal: ProcessRefused | None = None
 
@@ -89,7 +93,7 @@ class Supervisor:
         self._listen()
         self._watch()
         self._advance()
-        self._recorder.step()
+        self._recorder.step(make_room=self._waits_for_memory())
         if self._phase is _Phase.ENDED:
             self._tell(ServiceState.FINISHED)
             return None
@@ -112,7 +116,18 @@ class Supervisor:
             child = self._children.get(received.message.service)
             if child is not None:
                 child.heard(received.message, 1e-9 * received.arrival_time_ns)
+                self._tell_of(received.message)
         self._commits.receive()  # wakes; what was committed is in the journal
+
+    def _tell_of(self, status: ServiceStatus) -> None:
+        """Tell the user once if a process works, but not as it should."""
+        if status.state is ServiceState.DEGRADED and status.service not in self._told:
+            self._told.add(status.service)
+            self._on_event(f"{status.service}: waits: {status.detail}")
+
+    def _waits_for_memory(self) -> bool:
+        status = self._children[MAPPER.name].status
+        return status is not None and status.state is ServiceState.DEGRADED
 
     def _watch(self) -> None:
         now_s, names = self._now_s(), self._alive.names()
@@ -140,25 +155,33 @@ class Supervisor:
         for name, child in self._children.items():
             self._link.counters[f"{name}.deaths"] = child.deaths
             self._link.counters[f"{name}.hangs"] = child.hangs
-        self._link.tell(state, self._recorder.num_frames - 1, detail=self._phase.value)
+        self._link.tell(state, self._recorder.num_frames - 1, detail=f"{self._pacing}, {self._phase.value}")
 
     # --- ending -----------------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        """The sensor ends first, then the mapper with what the ring holds, then the tracker."""
+        """The sensor ends first, then the others, each when nothing is left of what the one before it gave.
+
+        Where every frame is mapped, the mapper knows by itself when that is, and needs the tracker until then.
+        In realtime the tracker says what was dropped to the last frame, and the mapper takes what there is.
+        """
         sensor, mapper, tracker = (self._children[process.name] for process in (SENSOR, MAPPER, TRACKER))
+        second, last = (tracker, mapper) if self._pacing is Pacing.REALTIME else (mapper, tracker)
         if self._phase is _Phase.RUNNING:
             if self._link.stopping:
                 self._end(sensor)
             if sensor.finished:
-                self._phase = _Phase.MAPPING_REST
-        if self._phase is _Phase.MAPPING_REST:
-            self._order(mapper, Command.DRAIN, through_frame_id=self._last_published())
-            if mapper.finished:
-                self._phase = _Phase.TRACKER_STOPPING
-        if self._phase is _Phase.TRACKER_STOPPING:
-            self._end(tracker)
-            if tracker.finished:
+                self._phase = _Phase.FINISHING
+        if self._phase is _Phase.FINISHING:
+            self._order(second, Command.DRAIN, through_frame_id=self._last_published())
+            if second.finished:
+                self._phase = _Phase.LAST_ENDING
+        if self._phase is _Phase.LAST_ENDING:
+            if last is mapper:
+                self._order(mapper, Command.DRAIN, through_frame_id=self._last_published())
+            else:
+                self._end(tracker)
+            if last.finished:
                 self._phase = _Phase.ENDED
 
     def _end(self, child: ChildProcess) -> None:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.optim.alignment import PosePrior
@@ -17,17 +18,11 @@ from vtslam.common.overlap.view_index import ViewIndex
 from vtslam.common.section import Section
 from vtslam.common.settings import TrackerSettings
 from vtslam.common.splat.engine import Engine
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 from vtslam.services.tracker.masks import mean_depth_m, near_and_valid, visible_in_section
 from vtslam.services.tracker.odometry import rgbd_odometry
 from vtslam.services.tracker.optimisers import PoseEstimate, PoseOptimiser, make_optimiser
-from vtslam.services.tracker.state import (
-    UNKNOWN_VARIANCE,
-    ExternalPose,
-    TrackerState,
-    TrackingQuality,
-    TrackingState,
-    TrackResult,
-)
+from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackResult
 
 _MIN_LOSSES = 5  # frames before the usual loss is known
 

@@ -1,7 +1,6 @@
 """What the tracker carries from frame to frame, and what it says of a frame."""
 
 from dataclasses import dataclass, field
-from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -10,39 +9,11 @@ from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.messages.mapping import MAX_LOSSES, MAX_MEAN_DEPTHS, TrackerHistory
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 
 _HISTORY_FRAMES = MAX_LOSSES  # losses remembered: enough for a stable median, bounded on endless streams
 _FAR_SAMPLES = MAX_MEAN_DEPTHS  # largest mean depths kept for the far filter (docs/method.md, 2.2)
 UNKNOWN_VARIANCE = 1e6  # of a pose that nothing was measured of
-
-
-class TrackingState(Enum):
-    """How far a pose can be trusted."""
-
-    OK = "ok"
-    WEAK = "weak"  # few usable pixels
-    LOST = "lost"  # no usable pixels, or the map does not agree with the frame
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrackingQuality:
-    """Facts about one estimated pose.
-
-    Attributes:
-        color_loss: Mean over the mask of sum_c |I - I'| at the last render.
-        depth_loss_m: Mean over the mask of |D - D'| at the last render.
-        covered_share: Pixels in the mask over all pixels.
-        renders: Renders spent.
-        section_id: The section it was tracked against; -1 if none.
-        rescued: Whether RGB-D odometry replaced the guess.
-    """
-
-    color_loss: float
-    depth_loss_m: float
-    covered_share: float
-    renders: int
-    section_id: int
-    rescued: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,32 +33,6 @@ class TrackResult:
     quality: TrackingQuality
     state: TrackingState
     overlap_section_id: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ExternalPose:
-    """A pose from another sensor: float64 [4,4] and the covariance [6,6] of a left twist on ``T_camera_world``.
-
-    Raises:
-        ValueError: The pose is not rigid, or the covariance not symmetric, finite and positive semi-definite.
-    """
-
-    T_world_camera: npt.NDArray[np.float64]
-    covariance: npt.NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        c = self.covariance
-        if not se3.is_rigid(self.T_world_camera):
-            raise ValueError("an external pose must be a rigid motion [4,4]")
-        if c.shape != (6, 6) or not np.isfinite(c).all() or not np.allclose(c, c.T):
-            raise ValueError("the covariance of an external pose must be a finite, symmetric [6,6] matrix")
-        if np.linalg.eigvalsh(c).min() < -1e-9 * max(float(np.abs(c).max()), 1e-30):
-            raise ValueError("the covariance of an external pose must be positive semi-definite")
-
-    def information(self) -> npt.NDArray[np.float64]:
-        """The inverse covariance [6,6]; directions said to be exact get a standard deviation of a micrometre."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        return np.asarray((vectors / np.maximum(values, 1e-12)) @ vectors.T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -168,3 +113,8 @@ class TrackerState:
             else self.largest_mean_depths_m,
             exposure=exposure or self.exposure,
         )
+
+
+def first_pose(frame: Frame) -> npt.NDArray[np.float64]:
+    """``T_world_camera`` float64 [4,4] of the first frame, which defines the world: its prior, or the identity."""
+    return np.eye(4) if frame.pose_prior is None else frame.pose_prior.T_world_camera

@@ -39,6 +39,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vtslam.common.config import ConfigError
+    from vtslam.common.external_pose import ExternalPose
     from vtslam.common.frame import Frame
     from vtslam.common.gaussians import ViewTiedGaussians
     from vtslam.common.geometry.camera import Camera
@@ -65,6 +66,7 @@ _HOMES = {
     "Camera": "common.geometry.camera",
     "ConfigError": "common.config",
     "Engine": "common.splat.engine",
+    "ExternalPose": "common.external_pose",
     "Frame": "common.frame",
     "FrameFacts": "services.frame_facts",
     "FramePublisher": "services.sensor.publisher",
@@ -97,6 +99,7 @@ __all__ = [
     "Camera",
     "ConfigError",
     "Engine",
+    "ExternalPose",
     "Frame",
     "FrameFacts",
     "FramePublisher",

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from vtslam.common.exposure import Exposure
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.messages import (
@@ -20,9 +21,6 @@ from vtslam.common.messages import (
     LoadOutcome,
     Message,
     Odometry,
-    PosePrior,
-    PoseQuality,
-    PoseState,
     SectionArchived,
     SectionReply,
     SectionRequest,
@@ -32,6 +30,7 @@ from vtslam.common.messages import (
     TrackedPose,
     TrackerHistory,
 )
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -97,19 +96,20 @@ def _pixels(rng: np.random.Generator) -> Message:
         camera=Camera(width=width, height=height, fx=120.0, fy=121.5, cx=width / 2, cy=height / 2),
         rgb=rng.integers(0, 256, (height, width, 3), np.uint8),
         depth=rng.integers(0, 65536, (height, width), np.uint16),
+        pose_prior=_prior(rng) if rng.integers(2) else None,
     )
 
 
-def _prior(rng: np.random.Generator) -> Message:
-    return PosePrior(capture_time_ns=_id(rng), frame_id=-1, T_world_camera=_pose(rng), covariance=_covariance(rng))
+def _prior(rng: np.random.Generator) -> ExternalPose:
+    return ExternalPose(T_world_camera=_pose(rng), covariance=_covariance(rng))
 
 
 def _credit(rng: np.random.Generator) -> Message:
     return Credit(acknowledged_frame_id=-1, next_frame_id=_id(rng), limit_frame_id=_id(rng), epoch=_id(rng))
 
 
-def _quality(rng: np.random.Generator) -> PoseQuality:
-    return PoseQuality(
+def _quality(rng: np.random.Generator) -> TrackingQuality:
+    return TrackingQuality(
         color_loss=float(rng.uniform()),
         depth_loss_m=float(rng.uniform()),
         covered_share=float(rng.uniform()),
@@ -131,7 +131,7 @@ def _tracked(rng: np.random.Generator) -> Message:
         T_world_camera=_pose(rng),
         covariance=_covariance(rng),
         quality=_quality(rng) if rng.integers(2) else None,
-        state=_one(rng, PoseState),
+        state=_one(rng, TrackingState),
         overlap_section_id=-1,
         history=TrackerHistory(
             color_losses=tuple(rng.uniform(size=4).tolist()),
@@ -151,7 +151,7 @@ def _odometry(rng: np.random.Generator) -> Message:
         velocity_camera=rng.normal(0.0, 1.0, 6),
         pose_covariance=_covariance(rng),
         velocity_covariance=_covariance(rng),
-        state=_one(rng, PoseState),
+        state=_one(rng, TrackingState),
         epoch=_id(rng),
     )
 
@@ -224,7 +224,6 @@ def _control(rng: np.random.Generator) -> Message:
 RANDOM: dict[type[Message], Callable[[np.random.Generator], Message]] = {
     FrameDescriptor: _descriptor,
     FramePixels: _pixels,
-    PosePrior: _prior,
     Credit: _credit,
     TrackedPose: _tracked,
     Odometry: _odometry,

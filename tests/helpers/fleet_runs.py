@@ -3,16 +3,20 @@
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Thread
 
 from helpers.recordings import ReplicaRecording, filled
 
+from vtslam.services.network import Door
 from vtslam.services.run_plan import RunPlan, plan_run
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.fleet_run import FleetHooks
+from vtslam.services.supervisor.live_run import run_live
 from vtslam.services.supervisor.supervisor import Supervisor
 
 FRAMES, SECTION = 20, 6
@@ -26,6 +30,7 @@ ASSIGNMENTS = (
     "mapper.keep_moments=true",
     "holdout=4",
     "splat.threads=1",
+    "fleet.pacing=lockstep",
 )
 
 
@@ -47,8 +52,9 @@ def write_small_recording(folder: Path) -> ReplicaRecording:
     return filled(recording)
 
 
-def small_plan(recording: ReplicaRecording, *assignments: str) -> RunPlan:
-    return plan_run(recording.uri, family="tum", assignments=[*ASSIGNMENTS, *assignments])
+def small_plan(recording: ReplicaRecording, *assignments: str, source: str = "") -> RunPlan:
+    """The plan of a run; ``source`` is added to the recording's URI."""
+    return plan_run(recording.uri + source, family="tum", assignments=[*ASSIGNMENTS, *assignments])
 
 
 def result_bytes(run: Path) -> dict[str, bytes]:
@@ -73,18 +79,26 @@ class Disturbance:
         signals: (frames, process, signal), each sent once.
         failpoints: By (process, start), as in ``shm.commit.before_flip:3``.
         events: What the supervisor told.
-        deaths: By process, afterwards.
-        hangs: By process, afterwards.
         pids: All that were seen.
+        children: The processes as their supervisor sees them.
     """
 
     signals: list[tuple[int, str, signal.Signals]] = field(default_factory=list)
     failpoints: dict[tuple[str, int], str] = field(default_factory=dict)
     events: list[str] = field(default_factory=list)
-    deaths: dict[str, int] = field(default_factory=dict)
-    hangs: dict[str, int] = field(default_factory=dict)
     pids: set[int] = field(default_factory=set)
+    children: Mapping[str, ChildProcess] = field(default_factory=dict)
     frames: int = 0
+
+    @property
+    def deaths(self) -> dict[str, int]:
+        """By process, up to now."""
+        return {name: child.deaths for name, child in self.children.items()}
+
+    @property
+    def hangs(self) -> dict[str, int]:
+        """By process, up to now."""
+        return {name: child.hangs for name, child in self.children.items()}
 
     def hooks(self, should_stop: Callable[[], bool] = lambda: False) -> FleetHooks:
         return FleetHooks(
@@ -103,8 +117,8 @@ class Disturbance:
         return {"VTSLAM_FAILPOINT": self.failpoints.get((name, epoch), "")}
 
     def _step(self, supervisor: Supervisor) -> None:
-        for name, child in supervisor.children.items():
-            self.deaths[name], self.hangs[name] = child.deaths, child.hangs
+        self.children = supervisor.children
+        for child in supervisor.children.values():
             if child.pid is not None:
                 self.pids.add(child.pid)
         for wanted in [each for each in self.signals if each[0] <= self.frames]:
@@ -123,3 +137,30 @@ def fleet_run(
 ) -> RunSummary:
     """The small recording through a fleet."""
     return small_plan(recording).execute_in_fleet(out, (disturbance or Disturbance()).hooks(should_stop))
+
+
+def live_run(
+    out: Path, fleet: str, disturbance: Disturbance, publish: Callable[[], None], *, door: Door | None = None
+) -> RunSummary:
+    """A live fleet that ends once ``publish``, in a thread of its own, has returned."""
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            publish()
+        except BaseException as error:
+            failed.append(error)
+
+    publisher = Thread(target=work)
+
+    def is_done() -> bool:
+        if publisher.ident is None:
+            publisher.start()
+        return not publisher.is_alive()
+
+    try:
+        hooks = disturbance.hooks(is_done)
+        return run_live(out, hooks, fleet=fleet, preset="fast", family="tum", assignments=ASSIGNMENTS, door=door)
+    finally:
+        publisher.join()
+        assert not failed, failed

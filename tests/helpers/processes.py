@@ -5,6 +5,7 @@ from pathlib import Path
 
 from vtslam.common.fleet_folder import SHARED_MEMORY, read_owner
 from vtslam.common.shm.process_identity import own_identity
+from vtslam.services.process_facts import is_gone
 
 _SOURCE = Path(__file__).resolve().parents[2] / "src"
 
@@ -13,28 +14,6 @@ def source_environment() -> dict[str, str]:
     """The environment, with this checkout's package first on the path."""
     paths = [str(_SOURCE), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-
-
-def is_gone(pid: int) -> bool:
-    """Whether there is no such process, or only what its parent has not taken note of."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return True
-    return state == "Z"
-
-
-def children_of(pid: int) -> set[int]:
-    """Pids of a process's children."""
-    found = set()
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent = path.read_text().rpartition(")")[2].split()[1]
-        except OSError:
-            continue
-        if int(parent) == pid:
-            found.add(int(path.parent.name))
-    return found
 
 
 def leftovers() -> list[str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers.forks import Progress, ended, forked, killed
-from helpers.shm_sections import SmallSection, frame_bytes, frame_of, shared_folder, spec_of
+from helpers.shm_sections import SmallSection, frame_bytes, frame_with_prior_of, shared_folder, spec_of
 
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.shm.active_layout import LEARNED_NAME
@@ -100,8 +100,8 @@ def _ring(folder: Path, *, waiting: bool) -> dict[str, int]:
         while not (folder / "stop").exists():
             sequence += 1
             if not waiting:
-                writer.publish_newest(frame_of(sequence, _CAMERA))
-            elif writer.try_publish(frame_of(sequence, _CAMERA), credit=2) is None:
+                writer.publish_newest(frame_with_prior_of(sequence, _CAMERA))
+            elif writer.try_publish(frame_with_prior_of(sequence, _CAMERA), credit=2) is None:
                 sequence -= 1
                 os.sched_yield()
 
@@ -115,9 +115,11 @@ def _ring(folder: Path, *, waiting: bool) -> dict[str, int]:
             try:
                 if pin:
                     with reader.using(newest) as frame:
-                        assert frame_bytes(frame) == frame_bytes(frame_of(newest.sequence, _CAMERA))
+                        assert frame_bytes(frame) == frame_bytes(frame_with_prior_of(newest.sequence, _CAMERA))
                 else:
-                    assert frame_bytes(reader.copied(newest)) == frame_bytes(frame_of(newest.sequence, _CAMERA))
+                    assert frame_bytes(reader.copied(newest)) == frame_bytes(
+                        frame_with_prior_of(newest.sequence, _CAMERA)
+                    )
             except FrameGone:
                 continue
             seen += 1
@@ -131,7 +133,7 @@ def _ring(folder: Path, *, waiting: bool) -> dict[str, int]:
                 taken += 1
                 assert descriptor.sequence == taken
                 with reader.using(descriptor) as frame:
-                    assert frame_bytes(frame) == frame_bytes(frame_of(taken, _CAMERA))
+                    assert frame_bytes(frame) == frame_bytes(frame_with_prior_of(taken, _CAMERA))
                 reader.acknowledge(taken)
 
     def hold(pinned: Progress, stays: bool) -> None:
@@ -147,7 +149,7 @@ def _ring(folder: Path, *, waiting: bool) -> dict[str, int]:
             break
         pinned.say("+")
         _wait_for_stop(folder, stays)
-        assert frame_bytes(held.frame) == frame_bytes(frame_of(newest.sequence, _CAMERA))
+        assert frame_bytes(held.frame) == frame_bytes(frame_with_prior_of(newest.sequence, _CAMERA))
 
     if waiting:
         deaths = _all_served(folder, write, [take_all], hold)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.geometry.camera import Camera
@@ -56,6 +57,16 @@ def frame_of(frame_id: int, camera: Camera = CAMERA) -> Frame:
         depth_scale_m=SCALE_M,
         camera=camera,
     )
+
+
+def frame_with_prior_of(frame_id: int, camera: Camera = CAMERA) -> Frame:
+    """The same with a pose prior that only this frame has; every third has none."""
+    if frame_id % 3 == 0:
+        return frame_of(frame_id, camera)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, 3] = frame_id
+    prior = ExternalPose(T_world_camera=T_world_camera, covariance=frame_id * np.eye(6))
+    return replace(frame_of(frame_id, camera), pose_prior=prior)
 
 
 def spec_of(section_id: int, *, with_moments: bool = True, kept_generations: int = 1) -> ActiveSpec:
@@ -187,7 +198,9 @@ def section_bytes(section: Section) -> bytes:
 def frame_bytes(frame: Frame) -> bytes:
     """All that a frame is, as bytes."""
     head = (frame.frame_id, frame.capture_time_ns, frame.depth_scale_m, frame.camera)
-    return repr(head).encode() + frame.rgb.tobytes() + frame.depth.tobytes()
+    prior = frame.pose_prior
+    told = b"" if prior is None else prior.T_world_camera.tobytes() + prior.covariance.tobytes()
+    return repr(head).encode() + told + frame.rgb.tobytes() + frame.depth.tobytes()
 
 
 def state_bytes(state: ActiveState) -> bytes:

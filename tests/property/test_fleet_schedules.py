@@ -1,9 +1,12 @@
 """A fleet's services under any order of events and any deaths: the result is always that of one process."""
 
 import pytest
-from helpers.fleet_world import expected, run_world
+from helpers.fleet_world import FRAMES, expected, run_world
 
 from vtslam.common.bus_schedule import KillAt, ScriptedSchedule, SeededKills, SeededSchedule
+from vtslam.common.shm.errors import SharedMemoryFull
+from vtslam.services.commit_facts import CommitFacts
+from vtslam.services.frame_journal import JournalWriter
 
 _SERVICES = ("sensor", "tracker", "mapper")
 _SEEDS = 60
@@ -13,6 +16,22 @@ def test_undisturbed() -> None:
     result, world = run_world(ScriptedSchedule())
     assert result == expected()
     assert world.deaths == []
+
+
+def test_a_journal_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, refused = JournalWriter.append, []
+
+    def append(journal: JournalWriter, facts: CommitFacts, *, section_ended: bool) -> None:
+        frame_id = facts.frame.facts.frame_id
+        if frame_id > 1 and frame_id not in refused:  # some section is sealed, so that room may come
+            refused.append(frame_id)
+            raise SharedMemoryFull("journal", wanted_bytes=700, free_bytes=0)
+        real(journal, facts, section_ended=section_ended)
+
+    monkeypatch.setattr(JournalWriter, "append", append)
+    result, _ = run_world(ScriptedSchedule())
+    assert refused == list(range(2, FRAMES))
+    assert result == expected()
 
 
 @pytest.mark.parametrize("name", _SERVICES)

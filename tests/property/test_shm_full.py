@@ -2,35 +2,23 @@
 
 import errno
 import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 from helpers.forks import run_script
 from helpers.shm_sections import SmallSection, frame_of, sealed_section, spec_of, state_bytes
+from helpers.small_tmpfs import can_mount, mounting
 
 from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
 from vtslam.common.shm.frame_ring import FrameRingWriter
 from vtslam.common.shm.map_store import MapStore
 from vtslam.common.shm.ring_layout import RingSpec
 
-# In a mount namespace of its own, gone with the process.
-_MOUNT = 'mount -t tmpfs -o size=2m,mode=0700 none "$0" && exec "$@"'
-
-
-def _can_mount(folder: Path) -> bool:
-    if shutil.which("unshare") is None:
-        return False
-    done = subprocess.run(["unshare", "-rm", "sh", "-c", _MOUNT, str(folder), "true"], capture_output=True, check=False)
-    return done.returncode == 0
-
 
 def test_small_tmpfs(tmp_path: Path) -> None:
-    if not _can_mount(tmp_path):
+    if not can_mount(tmp_path):
         pytest.skip("this user may not mount a tmpfs in a namespace of its own")
-    prefix = ["unshare", "-rm", "sh", "-c", _MOUNT, str(tmp_path)]
-    assert run_script("shm_full", str(tmp_path), prefix=prefix) == ["ring", "commit", "sealed"]
+    assert run_script("shm_full", str(tmp_path), prefix=mounting(tmp_path, size="2m")) == ["ring", "commit", "sealed"]
 
 
 def test_refused_reservations_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """A fleet of processes leaves what one process leaves, whichever of them dies and whenever."""
 
+import re
 import signal
 import socket
 from pathlib import Path
@@ -8,17 +9,19 @@ from urllib.request import urlopen
 
 import pytest
 from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
-from helpers.processes import is_gone, leftovers
+from helpers.processes import leftovers
 from helpers.recordings import cut_in_half
 from helpers.shared_data import shared_data
 
 from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.run_folder import RunFolder
 
 KILL = signal.SIGKILL
+LARGE_MAP = ("section.length=2", "fleet.map_budget_mb=16", "mapper.iterations_seal=1")
 
 
 def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_path: Path) -> None:
@@ -82,6 +85,38 @@ def test_a_process_that_is_killed_twice_changes_nothing(name: str, small: SmallR
     assert all(is_gone(pid) for pid in killed.pids)
 
 
+def test_priors_of_poses_are_used_and_outlive_processes(small: SmallRecording, tmp_path: Path) -> None:
+    plan = small_plan(small.files, source="?prior=0.02,0.5")
+    plan.execute(tmp_path / "one")
+    killed = Disturbance(signals=[(3, "tracker", KILL), (7, "sensor", KILL), (9, "tracker", KILL)])
+    plan.execute_in_fleet(tmp_path / "many", killed.hooks())
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
+    assert result_bytes(tmp_path / "one") != small.undisturbed
+
+
+def test_a_map_that_fills_its_memory_waits_for_the_disk(small: SmallRecording, tmp_path: Path) -> None:
+    plan = small_plan(small.files, "source.size=200x150", "source.frames=0:8", *LARGE_MAP)
+    plan.execute(tmp_path / "one")
+    calm = Disturbance()
+    plan.execute_in_fleet(tmp_path / "many", calm.hooks())
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
+    assert len(calm.events) == 1
+    assert re.match(r"mapper: waits: .* \d+ of the map store's 16000000 bytes are in use", calm.events[0])
+
+
+def test_a_map_that_cannot_fit_ends_the_fleet_in_order(small: SmallRecording, tmp_path: Path) -> None:
+    plan = small_plan(small.files, "source.size=640x480", *LARGE_MAP)
+    calm = Disturbance()
+    with pytest.raises(FleetError, match=r"\d+ bytes wanted, \d+ of the map store's 16000000 bytes are in use"):
+        plan.execute_in_fleet(tmp_path / "many", calm.hooks())
+
+    assert calm.events == []
+    assert all(is_gone(pid) for pid in calm.pids)
+    assert leftovers() == []
+
+
 def test_deaths_within_writes_to_shared_memory_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
     points = {
         ("mapper", 1): "shm.active.after_rename:1",
@@ -114,14 +149,23 @@ def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording,
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
     assert stopped.hangs == {"sensor": 0, "tracker": 1, "mapper": 0}
-    assert stopped.events == ["tracker: left the bus while it ran after 4 frames; started again"]
+    assert len(stopped.events) == 1
+    assert stopped.events[0].startswith("tracker: left the bus while it ran after ")
 
 
 def test_a_process_that_cannot_live_ends_the_fleet(small: SmallRecording, tmp_path: Path) -> None:
-    hopeless = Disturbance(failpoints={("mapper", start): "shm.commit.before_flip:1" for start in range(1, 9)})
-    with pytest.raises(FleetError, match="mapper: killed by signal 9 after 0 frames, for the 6th time"):
+    hopeless = Disturbance(failpoints={("mapper", start): "shm.adopt.before_epoch:1" for start in range(2, 9)})
+    hopeless.failpoints["mapper", 1] = f"shm.commit.after_flip:{SECTION + 3}"  # committed, but nobody was told
+    with pytest.raises(FleetError, match=f"mapper: killed by signal 9 after {SECTION + 2} frames, for the 6th time"):
         fleet_run(small.files, tmp_path / "run", hopeless)
 
+    with RunFolder.open(tmp_path / "run") as run:
+        facts, rows = run.read_info().facts, run.read_frames()
+        assert run.section_ids() == [0]
+    assert (facts.finished, facts.interrupted, facts.frames, len(rows)) == (False, False, SECTION + 3, SECTION + 3)
+    known = (tmp_path / "run" / "trajectory.txt").read_bytes()
+    assert known.count(b"\n") == SECTION + 3
+    assert small.undisturbed["trajectory.txt"].startswith(known)
     assert all(is_gone(pid) for pid in hopeless.pids)
     assert leftovers() == []
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runs import DEADLINE_S, POLL_S, start_run, wait_for
-from helpers.processes import children_of, is_gone, leftovers
+from helpers.processes import leftovers
 
 from vtslam.common.fleet_folder import sweep_dead_fleets
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
+from vtslam.services.process_facts import children_of, is_gone
 from vtslam.storage.run_folder import RunFolder
 
 

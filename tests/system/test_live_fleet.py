@@ -3,48 +3,21 @@
 import os
 import signal
 import time
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from threading import Thread
 
 import pytest
 from helpers.cli_runs import DEADLINE_S, POLL_S, start_vtslam
-from helpers.fleet_runs import ASSIGNMENTS, FRAMES, Disturbance, SmallRecording, result_bytes
+from helpers.fleet_runs import FRAMES, Disturbance, SmallRecording, live_run, result_bytes
 
 from vtslam.common.fleet_folder import running_fleets
+from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
-from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.publisher import FramePublisher
 from vtslam.services.sensor.sources.registry import open_source
-from vtslam.services.supervisor.live_run import run_live
 from vtslam.storage.run_folder import RunFolder
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "publish-your-sensor.md"
-
-
-def live_run(out: Path, fleet: str, disturbance: Disturbance, publish: Callable[[], None]) -> RunSummary:
-    """A live fleet that ends once ``publish``, in a thread of its own, has returned."""
-    failed: list[BaseException] = []
-
-    def work() -> None:
-        try:
-            publish()
-        except BaseException as error:
-            failed.append(error)
-
-    publisher = Thread(target=work)
-
-    def is_done() -> bool:
-        if publisher.ident is None:
-            publisher.start()
-        return not publisher.is_alive()
-
-    try:
-        hooks = disturbance.hooks(is_done)
-        return run_live(out, hooks, fleet=fleet, preset="fast", family="tum", assignments=ASSIGNMENTS)
-    finally:
-        publisher.join()
-        assert not failed, failed
 
 
 @pytest.mark.parametrize(
@@ -73,9 +46,26 @@ def test_what_is_published_is_mapped_as_the_recording_is(
     assert (facts.finished, facts.width, facts.height, facts.end_frame) == (True, 64, 48, FRAMES)
 
 
+def test_a_clock_that_goes_back_ends_nothing(small: SmallRecording, tmp_path: Path) -> None:
+    source = open_source(small.files.uri)
+
+    def publish() -> None:
+        with FramePublisher("test-clock") as publisher:
+            for index, time_ns in enumerate([1000, 2000, 1500, 3000]):
+                publisher.publish(replace(source.frame(index), capture_time_ns=time_ns))
+
+    summary = live_run(tmp_path / "run", "test-clock", Disturbance(), publish)
+
+    assert summary.frames == 4
+    with RunFolder.open(tmp_path / "run") as run:
+        assert read_trajectory(run.trajectory_path).capture_times_ns.tolist() == [1000, 2000, 2001, 3000]
+
+
 def test_up_and_publish_on_the_command_line(small: SmallRecording, tmp_path: Path) -> None:
     out, fleet = tmp_path / "run", f"test-up-{os.getpid()}"
-    process = start_vtslam("up", "--fleet", fleet, "--out", str(out), "--set", "section.length=3")
+    process = start_vtslam(
+        "up", "--fleet", fleet, "--out", str(out), "--pacing", "lockstep", "--set", "section.length=3"
+    )
     try:
         for _ in range(int(DEADLINE_S / POLL_S)):
             if fleet in running_fleets():

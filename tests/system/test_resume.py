@@ -21,15 +21,18 @@ from helpers.fleet_runs import (
     result_bytes,
     small_plan,
 )
-from helpers.processes import children_of, leftovers
+from helpers.processes import leftovers
 from helpers.recordings import cut_in_half
 from helpers.small_runs import small_run
 
 from vtslam.common.fleet_folder import sweep_dead_fleets
 from vtslam.services.cli.__main__ import main
 from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.process_facts import children_of
 from vtslam.services.run_plan import plan_resume
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor.errors import FleetError
+from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.storage import atomic
 from vtslam.storage.errors import ChecksumMismatch, RunFolderError, RunLocked, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
@@ -160,6 +163,38 @@ def test_a_run_that_publishers_fed_cannot_be_resumed(tmp_path: Path, capsys: pyt
         run.write_info(replace(info, facts=replace(info.facts, source="live:")))
     assert main(["run", "--resume", str(path)]) == 1
     assert "publishers fed this run, and their frames are gone" in capsys.readouterr().err
+
+
+def test_a_pipelined_fleet_goes_on_to_its_own_bytes(small: SmallRecording, tmp_path: Path) -> None:
+    run, plan = tmp_path / "run", small_plan(small.files, "fleet.pacing='pipelined'")
+    plan.execute_in_fleet(tmp_path / "calm", Disturbance().hooks())
+    with pytest.raises(CutOff):
+        plan.execute_in_fleet(run, FleetHooks(on_frame=cut_off_at(2 * SECTION + 2)))
+    done = RunFolder.open(run).catalog.num_frames
+    plan_resume(run).resume_in_fleet(run, Disturbance(frames=done).hooks())
+
+    assert done >= SECTION
+    assert result_bytes(run) == result_bytes(tmp_path / "calm") != small.undisturbed
+
+
+def test_what_a_broken_fleet_had_mapped_is_known_and_mapped_again(small: SmallRecording, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    hopeless = Disturbance(failpoints={("mapper", start): "shm.adopt.before_epoch:1" for start in range(2, 9)})
+    hopeless.failpoints["mapper", 1] = f"shm.commit.after_flip:{SECTION + 3}"
+    with pytest.raises(FleetError):
+        fleet_run(small.files, run, hopeless)
+    assert RunFolder.open(run).catalog.num_frames == SECTION + 3
+    assert len(RunFolder.open(run).catalog.poses()[1]) == SECTION + 3
+    plan_resume(run).resume(run)
+
+    assert result_bytes(run) == small.undisturbed
+
+
+def test_a_run_that_dropped_frames_cannot_be_resumed(small: SmallRecording, tmp_path: Path) -> None:
+    plan = small_plan(small.files, "fleet.pacing='realtime'")
+    RunFolder.create(tmp_path / "run", plan._info(None)).close()
+    with pytest.raises(RunFolderError, match="dropped frames to keep up with time; it cannot be resumed"):
+        plan_resume(tmp_path / "run")
 
 
 def test_a_fleet_that_was_stopped_maps_its_short_section_again(small: SmallRecording, tmp_path: Path) -> None:

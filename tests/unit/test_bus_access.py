@@ -11,7 +11,7 @@ import zenoh
 
 from vtslam.common.bus_access import LOCAL_USER, Login, NetworkAccess, TlsFiles, write_password_file
 from vtslam.common.bus_config import hub_config, member_config, remote_member_config
-from vtslam.common.topics import SENSOR_PIXELS, SENSOR_POSE_PRIOR, TOPICS, Role
+from vtslam.common.topics import SENSOR_PIXELS, TOPICS, Role
 
 _DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 _TLS = TlsFiles(authority=Path("a.pem"), certificate=Path("c.pem"), key=Path("k.pem"))
@@ -59,7 +59,7 @@ def test_a_remote_sensors_rights_are_those_of_the_topic_table() -> None:
     assert control["default_permission"] == "deny"
     own = [rule for rule in control["rules"] if rule["id"].startswith("remote_sensor")]
     put = [key for rule in own if "put" in rule["messages"] and "ingress" in rule["flows"] for key in rule["key_exprs"]]
-    assert put == [SENSOR_PIXELS.key("x"), SENSOR_POSE_PRIOR.key("x")]
+    assert put == [SENSOR_PIXELS.key("x")]
     read = [key for rule in own if "put" in rule["messages"] and "egress" in rule["flows"] for key in rule["key_exprs"]]
     assert len(read) == sum(Role.REMOTE_SENSOR in topic.readers_elsewhere for topic in TOPICS)
     assert all(key.startswith("vtslam/x/") for key in (*put, *read))

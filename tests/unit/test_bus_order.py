@@ -4,12 +4,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import zenoh
 from helpers.bus_backends import zenoh_backend
 from helpers.bus_messages import descriptor
 
-from vtslam.common.bus_order import MAX_AGAIN, Arrivals
+from vtslam.common.bus import BusError
+from vtslam.common.bus_inbox import Subscriber
+from vtslam.common.bus_life import AliveWatcher
+from vtslam.common.bus_order import MAX_AGAIN, Arrivals, Gap
 from vtslam.common.bus_received import Received
-from vtslam.common.messages import FrameDescriptor
+from vtslam.common.messages import FrameDescriptor, encode
 from vtslam.common.topics import SENSOR_FRAME, Role
 
 SECOND_NS = 1_000_000_000
@@ -159,3 +163,48 @@ def test_messages_that_never_reached_the_bus_arrive_all_the_same(monkeypatch: py
         assert [each.message.frame_id for each in received if each] == list(range(count))
         assert subscriber.traffic().missed == 0
         assert subscriber.health().valid
+
+
+def test_what_is_left_after_closing_is_read_without_asking_anybody() -> None:
+    now_ns = [0]
+    asked: list[Gap] = []
+    subscriber = Subscriber(
+        SENSOR_FRAME,
+        newest_only=False,
+        monotonic_ns=lambda: now_ns[0],
+        watcher=AliveWatcher(lambda: None),
+        notify=lambda: None,
+        release=lambda: None,
+        ask_again=asked.append,
+    )
+    for sequence in (0, 2):
+        message = descriptor(sequence)
+        subscriber.arrived(encode(message, origin=1, sequence=sequence, publish_time_ns=0, max_bytes=8192))
+    now_ns[0] = SECOND_NS
+    assert subscriber.lacks
+    subscriber.close()
+    first = subscriber.receive()
+    assert first is not None
+    assert first.sequence == 0
+    assert subscriber.receive() is None
+    assert not subscriber.lacks
+    assert asked == []
+
+
+def test_a_message_that_could_not_be_sent_keeps_its_number() -> None:
+    class Broken:
+        def put(self, data: bytes) -> None:
+            raise zenoh.ZError("no")
+
+    with zenoh_backend() as backend:
+        sensor, tracker = backend.join(Role.SENSOR), backend.join(Role.TRACKER)
+        frames, publisher = tracker.subscriber(SENSOR_FRAME), sensor.publisher(SENSOR_FRAME)
+        assert publisher.publish(descriptor(0)) == 0
+        whole = publisher._declared  # type: ignore[attr-defined]
+        publisher._declared = Broken()  # type: ignore[attr-defined]
+        with pytest.raises(BusError, match="sensor/frame: no"):
+            publisher.publish(descriptor(1))
+        publisher._declared = whole  # type: ignore[attr-defined]
+        assert publisher.publish(descriptor(2)) == 2
+        read = [tracker.receive(frames, timeout_s=30.0) for _ in range(3)]
+        assert [each.message.frame_id for each in read if each is not None] == [0, 1, 2]

@@ -87,6 +87,7 @@ def test_many_deaths_without_a_commit_are_the_end(child: ChildProcess) -> None:
 
 
 def test_a_process_that_says_that_it_is_of_no_use_is_believed(child: ChildProcess) -> None:
+    child._folder.reserve_failure("mapper")
     child._folder.write_failure("mapper", "no room for a section")
     end(child, REFUSED)
     with pytest.raises(ProcessRefused, match="no room for a section"):

@@ -125,3 +125,16 @@ def test_ring_frames_survive_as_published(tmp_path: Path) -> None:
     with pytest.raises(SharedMemoryError, match="expected nothing, found a file"):
         FrameRingWriter.create(tmp_path / "ring", RingSpec(width=16, height=12))
     assert ring.publish_newest(frame_of(5)).sequence == 1
+
+
+def test_word_of_a_failure_fits_into_the_room_reserved_for_it(tmp_path: Path) -> None:
+    folder = FleetFolder.create("one", base=tmp_path)
+    folder.reserve_failure("mapper")
+    assert folder.failure("mapper") == folder.failure("tracker") == ""
+    size = (folder.path / "failed-mapper").stat().st_blocks
+    folder.write_failure("mapper", "a" * 10_000)
+    assert folder.failure("mapper") == "a" * 4096
+    folder.write_failure("mapper", "no room: ä")
+    assert folder.failure("mapper") == "no room: ä"
+    assert (folder.path / "failed-mapper").stat().st_blocks == size > 0
+    folder.remove()

@@ -1,5 +1,7 @@
 """The journal of committed frames: whole lines, in order, section by section."""
 
+import errno
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from vtslam.common.messages import TrackerHistory
+from vtslam.common.shm.errors import SharedMemoryFull
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame, FrameFacts
 from vtslam.services.frame_journal import JournalReader, JournalWriter
@@ -44,6 +47,7 @@ def facts_of(frame_id: int) -> CommitFacts:
     T[0, 3] = 0.1 * frame_id
     return CommitFacts(
         num_frames=frame_id + 1,
+        num_tracked=frame_id + 1,
         sequence=frame_id + 1,
         iterations=3,
         frame=CommittedFrame(facts=about, capture_time_ns=frame_id, T_world_camera=T),
@@ -95,6 +99,30 @@ def test_a_line_that_was_cut_is_written_anew(folder: Path) -> None:
     append(writer, 1, 2)
     assert new_ids(reader) == [1, 2]
     writer.close()
+
+
+def test_a_line_that_does_not_fit_leaves_nothing_and_can_be_tried_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer, reader = JournalWriter(folder), JournalReader(folder)
+    append(writer, 0)
+    real, calls = os.write, []
+
+    def full_after_some_bytes(fd: int, data: bytes) -> int:
+        calls.append(len(data))
+        if len(calls) > 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(fd, data[:10])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full_after_some_bytes)
+        with pytest.raises(SharedMemoryFull, match=r"journal/000000: \d+ bytes of shared memory wanted"):
+            append(writer, 1)
+    append(writer, 2)
+    writer.close()
+
+    assert len(calls) == 2
+    assert new_ids(reader) == [0, 2]
 
 
 def test_durable_sections_are_forgotten_also_if_they_are_announced_again(folder: Path) -> None:

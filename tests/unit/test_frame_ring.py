@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.shm_sections import frame_bytes, frame_of
+from helpers.shm_sections import frame_bytes, frame_of, frame_with_prior_of
 
 from vtslam.common.shm._atomics import Words
 from vtslam.common.shm.blocks import ControlPage, Kind, open_file
@@ -49,6 +49,17 @@ def test_a_frame_comes_out_as_it_went_in_and_cannot_be_changed(path: Path, write
                 image[0, 0] = 1
             with pytest.raises(ValueError, match="cannot set WRITEABLE"):
                 image.flags.writeable = True
+
+
+def test_a_prior_comes_out_as_it_went_in_and_does_not_stay_for_the_next_frame(
+    path: Path, writer: FrameRingWriter
+) -> None:
+    reader = FrameRingReader(path)
+    for number in range(1, 8):  # more than there are slots
+        frame = frame_with_prior_of(number)
+        descriptor = writer.publish_newest(frame)
+        assert (reader.copied(descriptor).pose_prior is None) == (frame.pose_prior is None) == (number % 3 == 0)
+        assert frame_bytes(reader.copied(descriptor)) == frame_bytes(frame)
 
 
 def test_waiting_stops_at_the_credit_and_goes_on_after_an_acknowledgement(writer: FrameRingWriter) -> None:

@@ -9,11 +9,11 @@ import pytest
 from helpers.bus_messages import MAX_BYTES, RANDOM, descriptor, status
 
 from vtslam.common.messages import Message, MessageError, Reason, decode, encode
-from vtslam.common.messages.mapping import FrameCommitted, PoseQuality, PoseState, TrackedPose
+from vtslam.common.messages.mapping import FrameCommitted, TrackedPose
 from vtslam.common.messages.sensing import FrameDescriptor, FramePixels
 from vtslam.common.topics import QUERIES, TOPICS
 from vtslam.services.mapper.state import CommitRecord
-from vtslam.services.tracker.state import TrackingQuality, TrackingState, TrackResult
+from vtslam.services.tracker.state import TrackResult
 
 M = TypeVar("M", bound=Message)
 
@@ -170,6 +170,4 @@ def test_results_of_the_cores_fit_into_messages() -> None:
         return {field.name for field in fields(kind)}  # type: ignore[arg-type]
 
     assert names(TrackResult) <= names(TrackedPose)
-    assert names(TrackingQuality) == names(PoseQuality)
     assert names(CommitRecord) <= names(FrameCommitted)
-    assert [state.value for state in TrackingState] == [state.value for state in PoseState]

@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 from helpers.small_map import pose_error, room_frame, room_pose, section_bytes, without_depth
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.metrics_trajectory import trajectory_errors
@@ -15,9 +16,9 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.native_engine import NativeEngine
+from vtslam.common.tracking_facts import TrackingState
 from vtslam.services.section_map import ReadsSections
 from vtslam.services.system import FrameReport, System
-from vtslam.services.tracker.state import ExternalPose, TrackingState
 from vtslam.storage.section_convert import record_of, section_of
 
 N, FRAMES, PATH = 6, 15, 48  # frames of a section, of the run, of the closed path they are on
@@ -79,12 +80,10 @@ class SlowClock:
         return self.now_s
 
 
-def run(
-    settings: Settings, frames: list[Frame], *, threads: int = 1, priors: dict[int, ExternalPose] | None = None
-) -> Run:
+def run(settings: Settings, frames: list[Frame], *, threads: int = 1) -> Run:
     archive = MemoryArchive()
     system = System(settings, NativeEngine(threads=threads), archive, threads=threads)
-    reports = [system.process(frame, prior=(priors or {}).get(i)) for i, frame in enumerate(frames)]
+    reports = [system.process(frame) for frame in frames]
     return Run(system=system, reports=reports, archive=archive, seal_renders=system.finish())
 
 
@@ -229,8 +228,11 @@ def test_a_prior_places_the_first_frame_and_steers_the_others() -> None:
     lift = se3.exp(np.array([3.0, -2.0, 1.0, 0.3, 0.2, 0.5]))
     truth = lift @ true_poses()
     covariance = 1e-10 * np.eye(6)
-    priors = {i: ExternalPose(T_world_camera=truth[i], covariance=covariance) for i in range(4)}
-    result = run(settings_of(), room_frames()[:4], priors=priors)
+    frames = [
+        replace(frame, pose_prior=ExternalPose(T_world_camera=true, covariance=covariance))
+        for frame, true in zip(room_frames()[:4], truth, strict=False)
+    ]
+    result = run(settings_of(), frames)
     np.testing.assert_allclose(result.poses[0], truth[0], atol=1e-12)
     for found, true in zip(result.poses, truth, strict=False):
         assert pose_error(found, true)[0] < 1e-3

@@ -23,7 +23,7 @@ def test_every_topic_says_who_publishes_it_and_what_fits() -> None:
 
 def test_who_may_come_from_elsewhere_publishes_no_poses_and_gives_no_orders() -> None:
     allowed = {topic.suffix for topic in TOPICS if Role.REMOTE_SENSOR in topic.publishers}
-    assert allowed == {"sensor/pixels", "sensor/pose_prior"}
+    assert allowed == {"sensor/pixels"}
 
 
 def test_keys_lie_below_their_fleet() -> None:

@@ -13,8 +13,9 @@ from vtslam.common.geometry import se3
 from vtslam.common.section import Section
 from vtslam.common.settings import AdamSettings, TrackerSettings
 from vtslam.common.splat.native_engine import NativeEngine
+from vtslam.common.tracking_facts import TrackingState
 from vtslam.services.tracker.core import Tracker
-from vtslam.services.tracker.state import TrackerState, TrackingState, TrackResult
+from vtslam.services.tracker.state import TrackerState, TrackResult
 
 Array = npt.NDArray[np.float64]
 

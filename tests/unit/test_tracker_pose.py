@@ -17,12 +17,14 @@ from helpers.small_map import (
 )
 from helpers.smooth_room import SmoothRoom, small_camera
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.geometry import se3
 from vtslam.common.section import Section
 from vtslam.common.settings import AdamSettings, GaussNewtonSettings, MapperSettings, TrackerSettings
 from vtslam.common.splat.native_engine import NativeEngine
+from vtslam.common.tracking_facts import TrackingState
 from vtslam.services.tracker.core import Tracker
-from vtslam.services.tracker.state import ExternalPose, TrackerState, TrackingState
+from vtslam.services.tracker.state import TrackerState
 
 CAMERA = small_camera()
 ROOM = SmoothRoom(seed=3)

@@ -4,7 +4,8 @@ import numpy as np
 from helpers.smooth_room import SmoothRoom, small_camera
 
 from vtslam.common.geometry import se3
-from vtslam.services.tracker.state import TrackerState, TrackingQuality, TrackingState, TrackResult
+from vtslam.common.tracking_facts import TrackingQuality, TrackingState
+from vtslam.services.tracker.state import TrackerState, TrackResult
 
 STEP = se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.04, -0.02]))
 START = se3.exp(np.array([1.0, 2.0, -1.0, 0.3, -0.5, 1.2]))

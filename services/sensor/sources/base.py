@@ -1,6 +1,6 @@
 """The protocol of all sources, their errors, and the URI that names one."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 from urllib.parse import parse_qsl, urlencode
 
@@ -80,3 +80,9 @@ class SourceUri:
         """The text that :meth:`parse` reads back."""
         query = f"?{urlencode(self.options, safe=':/,')}" if self.options else ""
         return f"{self.scheme}:{self.path}{query}"
+
+
+def with_option(uri: str, key: str, value: str) -> str:
+    """The URI with an option more, or with another value of it."""
+    parsed = SourceUri.parse(uri)
+    return str(replace(parsed, options={**parsed.options, key: value}))

@@ -8,7 +8,8 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.services.sensor.sources.base import Source, SourceError, SourceUri
+from vtslam.services.sensor.sources.base import Source, SourceError, SourceUri, with_option
+from vtslam.services.sensor.sources.pose_priors import OPTIONS, with_pose_priors
 
 Size = tuple[int, int]
 
@@ -49,8 +50,9 @@ def open_source(
     """Open a source.
 
     Every source also takes the options ``size=WxH`` and ``range=A:B`` (frames A to B-1, then counted from 0; B may be
-    left out). The arguments replace them. They are part of the ``uri`` of the result, which therefore opens the very
-    same frames again, also when the same arguments are given once more.
+    left out), and those of `vtslam.services.sensor.sources.pose_priors`. The arguments replace them. They are part of
+    the ``uri`` of the result, which therefore opens the very same frames again, also when the same arguments are given
+    once more.
 
     Args:
         uri: ``scheme:path?key=value``.
@@ -69,9 +71,12 @@ def open_source(
     if parsed.scheme not in _READERS:
         known = ", ".join(form for form, _ in _READERS.values())
         raise SourceError(f"expected a source among {known}; found {uri!r}")
+    asked = {key: options.pop(key) for key in OPTIONS if key in options}
     source = _READERS[parsed.scheme][1](replace(parsed, options=options), size)
     if size is not None:
         source = _resized(source, size)
+    if asked:
+        source = with_pose_priors(source, asked)
     if frames is None and range_text is not None:
         frames = _parsed_range(range_text, len(source))
     return source if frames is None else _sub_range(source, frames)
@@ -143,7 +148,7 @@ def _resized(source: Source, size: Size) -> Source:
         raise SourceError(f"size: expected a positive width and height, found {width}x{height}")
     if size == (source.camera.width, source.camera.height):
         return source
-    uri = _with_option(source.uri, "size", f"{width}x{height}")
+    uri = with_option(source.uri, "size", f"{width}x{height}")
     return _Resized(inner=source, uri=uri, camera=source.camera.resized(width, height))
 
 
@@ -151,12 +156,7 @@ def _sub_range(source: Source, frames: tuple[int, int]) -> Source:
     first, end = frames
     if not 0 <= first < end <= len(source):
         raise SourceError(f"{source.uri}: expected frames A:B with 0 <= A < B <= {len(source)}, found {first}:{end}")
-    return _SubRange(inner=source, uri=_with_option(source.uri, "range", f"{first}:{end}"), first=first, end=end)
-
-
-def _with_option(uri: str, key: str, value: str) -> str:
-    parsed = SourceUri.parse(uri)
-    return str(replace(parsed, options={**parsed.options, key: value}))
+    return _SubRange(inner=source, uri=with_option(source.uri, "range", f"{first}:{end}"), first=first, end=end)
 
 
 def _parsed_size(text: str) -> Size:

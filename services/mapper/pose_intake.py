@@ -1,0 +1,100 @@
+"""Which of the tracker's poses is mapped next: each in its turn, or the newest."""
+
+from typing import Protocol
+
+from vtslam.common.bus import Bus
+from vtslam.common.messages import TrackedPose
+from vtslam.common.topics import TRACKER_POSE
+
+
+class PoseIntake(Protocol):
+    """Takes in poses, and gives the one to map."""
+
+    @property
+    def may_skip(self) -> bool:
+        """Whether a pose need not be mapped."""
+        ...
+
+    def listen(self, num_frames: int, sequence: int) -> None:
+        """Take in what has come; ``num_frames`` are committed, the last one of ``sequence`` in the ring."""
+        ...
+
+    def take(self, num_frames: int) -> TrackedPose | None:
+        """The pose to map next, if it is there."""
+        ...
+
+    def is_drained(self, num_frames: int, through_frame_id: int | None) -> bool:
+        """Whether nothing is left to map, once an order to end has come."""
+        ...
+
+
+class EveryPose:
+    """All poses, in order (lockstep, pipelined).
+
+    Args:
+        bus: The mapper's session.
+    """
+
+    may_skip = False
+
+    def __init__(self, bus: Bus) -> None:
+        self._tracked = bus.subscriber(TRACKER_POSE)
+        self._poses: dict[int, TrackedPose] = {}
+
+    def listen(self, num_frames: int, sequence: int) -> None:
+        """See `PoseIntake`."""
+        while (tracked := self._tracked.receive()) is not None:
+            if tracked.message.frame_id >= num_frames:
+                self._poses[tracked.message.frame_id] = tracked.message
+
+    def take(self, num_frames: int) -> TrackedPose | None:
+        """See `PoseIntake`."""
+        return self._poses.pop(num_frames, None)
+
+    def is_drained(self, num_frames: int, through_frame_id: int | None) -> bool:
+        """See `PoseIntake`."""
+        return through_frame_id is not None and num_frames > through_frame_id
+
+
+class NewestPose:
+    """The newest pose that fits where the map stands (realtime); older ones are never mapped.
+
+    A section's head has to be tracked after the section before it was sealed, and its other frames against it.
+
+    Args:
+        bus: The mapper's session.
+        section_length: Frames of a section.
+    """
+
+    may_skip = True
+
+    def __init__(self, bus: Bus, *, section_length: int) -> None:
+        # Not newest-only: a mapper that starts again gets the pose that came before, which may be the only one.
+        self._tracked = bus.subscriber(TRACKER_POSE)
+        self._section_length = section_length
+        self._newest: TrackedPose | None = None
+        self._ended = False
+
+    def listen(self, num_frames: int, sequence: int) -> None:
+        """See `PoseIntake`."""
+        while (tracked := self._tracked.receive()) is not None:
+            if self._newest is None or tracked.message.slot_sequence > self._newest.slot_sequence:
+                self._newest = tracked.message
+        newest = self._newest
+        if newest is not None and (newest.slot_sequence <= sequence or not self._fits(newest, num_frames)):
+            self._newest = None
+
+    def take(self, num_frames: int) -> TrackedPose | None:
+        """See `PoseIntake`."""
+        pose, self._newest = self._newest, None
+        return None if self._ended else pose
+
+    def is_drained(self, num_frames: int, through_frame_id: int | None) -> bool:
+        """See `PoseIntake`."""
+        if through_frame_id is not None and self._newest is None:
+            self._ended = True  # poses that come later are not mapped
+        return self._ended
+
+    def _fits(self, pose: TrackedPose, num_frames: int) -> bool:
+        section_id, row = divmod(num_frames, self._section_length)
+        return pose.section_id == section_id and pose.generation >= num_frames - row + min(row, 1)
