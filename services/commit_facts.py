@@ -1,12 +1,14 @@
 """What a commit in the map store holds beside the section: all else that tracker and mapper carry between frames."""
 
 import json
+import zlib
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
+from vtslam.common.frame import Frame
 from vtslam.common.messages import TrackerHistory
 from vtslam.services.frame_facts import CommittedFrame
 
@@ -23,6 +25,7 @@ class CommitFacts:
         frame: The frame.
         T_world_previous: float64 [4,4], the committed pose before it; None for the first frame.
         history: What the tracker remembers.
+        pixels_crc32: `pixels_crc32` of the frame.
     """
 
     num_frames: int
@@ -32,6 +35,11 @@ class CommitFacts:
     frame: CommittedFrame
     T_world_previous: npt.NDArray[np.float64] | None
     history: TrackerHistory
+    pixels_crc32: int
+
+    def saw(self, frame: Frame) -> bool:
+        """Whether ``frame`` has the pixels of the one that was committed."""
+        return pixels_crc32(frame) == self.pixels_crc32
 
     @property
     def committed_poses(self) -> tuple[npt.NDArray[np.float64], ...]:
@@ -63,6 +71,7 @@ class CommitFacts:
             "frame": self.frame.as_plain(),
             "T_world_previous": before,
             "history": asdict(self.history),
+            "pixels_crc32": self.pixels_crc32,
         }
         return json.dumps(plain).encode()
 
@@ -79,4 +88,10 @@ class CommitFacts:
             frame=CommittedFrame.from_plain(plain["frame"]),
             T_world_previous=None if before is None else np.array(before, np.float64),
             history=TrackerHistory(**{name: tuple(values) for name, values in plain["history"].items()}),
+            pixels_crc32=plain["pixels_crc32"],
         )
+
+
+def pixels_crc32(frame: Frame) -> int:
+    """A checksum of a frame's colour and depth."""
+    return zlib.crc32(np.ascontiguousarray(frame.depth).data, zlib.crc32(np.ascontiguousarray(frame.rgb).data))

@@ -13,7 +13,7 @@ FIRST_FRAME_STATE, KNOWN_STATE = "first", "known"  # not tracked: defines the wo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameFacts:
-    """One line of ``frames.jsonl``.
+    """What the catalogue keeps as the quality of a frame.
 
     Attributes:
         frame_id: Place in the stream, from 0.

@@ -1,67 +1,134 @@
 """The committed frames of a fleet, one line each, beside the map store: what the run folder is made from.
 
-The line of a frame is written after its commit, and again after a restart, so that at most that one is ever missing.
-A later line of the same frame replaces an earlier one.
+Lines of a section are in a file of its own, which goes when the section is durable. The line of a frame is written
+after its commit, and again after a restart, so that at most that one is ever missing. A later line of the same frame
+replaces an earlier one; the line that ends a section also says what a run goes on from.
 """
 
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 from vtslam.common.shm.blocks import refusal_of
+from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JournalLine:
+    """A committed frame; with ``ended``, all that was committed, if its section ended with it."""
+
+    frame: CommittedFrame
+    ended: CommitFacts | None
 
 
 class JournalWriter:
     """Appends frames.
 
     Args:
-        path: The file; what a killed writer left of its last line is cut off.
+        folder: Made if it is not there; what a killed writer left of its last line is cut off.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        data = path.read_bytes()
-        whole = data.rfind(b"\n") + 1
-        os.ftruncate(self._fd, whole)
-        os.lseek(self._fd, whole, os.SEEK_SET)
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        self._folder = folder
+        self._file: tuple[int, int] | None = None  # section and descriptor
 
-    def append(self, frame: CommittedFrame) -> None:
+    def append(self, facts: CommitFacts, *, section_ended: bool) -> None:
         """Write a frame's line; raises SharedMemoryFull with nothing written."""
-        data = json.dumps(frame.as_plain()).encode() + b"\n"
-        start, written = os.lseek(self._fd, 0, os.SEEK_CUR), 0
+        plain = facts.frame.as_plain()
+        if section_ended:
+            plain["ended"] = facts.packed().decode()
+        data = json.dumps(plain).encode() + b"\n"
+        section_id = facts.frame.facts.section_id
+        descriptor = self._descriptor(section_id)
+        start, written = os.lseek(descriptor, 0, os.SEEK_CUR), 0
         try:
             while written < len(data):
-                written += os.write(self._fd, data[written:])
+                written += os.write(descriptor, data[written:])
         except OSError as error:
-            os.ftruncate(self._fd, start)
-            os.lseek(self._fd, start, os.SEEK_SET)
-            raise refusal_of(self._path, error, len(data)) from error
+            os.ftruncate(descriptor, start)
+            os.lseek(descriptor, start, os.SEEK_SET)
+            raise refusal_of(_path(self._folder, section_id), error, len(data)) from error
 
     def close(self) -> None:
         """Give the descriptor back."""
-        os.close(self._fd)
+        if self._file is not None:
+            os.close(self._file[1])
+            self._file = None
+
+    def _descriptor(self, section_id: int) -> int:
+        if self._file is None or self._file[0] != section_id:
+            self.close()
+            self._file = section_id, _open_at_last_line(_path(self._folder, section_id))
+        return self._file[1]
 
 
 class JournalReader:
-    """Reads frames as they come; the file need not be there yet.
+    """Reads frames as they come; the folder need not be there yet.
 
     Args:
-        path: The file.
+        folder: The folder.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._offset = path, 0
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._section_id, self._offset = folder, 0, 0
 
-    def new_frames(self) -> list[CommittedFrame]:
-        """The frames of whole lines that were not read before."""
+    def new_lines(self) -> list[JournalLine]:
+        """The whole lines that were not read before, in order."""
+        lines = []
+        # Seen before this section's file is read, so that it is complete if a later one is there.
+        while (last := self._last_section()) is not None and last >= self._section_id:
+            lines += self._new_lines_here()
+            if last == self._section_id:
+                break
+            self._section_id, self._offset = self._section_id + 1, 0
+        return lines
+
+    def forget_before(self, section_id: int) -> None:
+        """Delete the lines of sections before this one, which are durable."""
+        for found in self._sections():
+            if found < section_id:
+                _path(self._folder, found).unlink(missing_ok=True)
+        if section_id > self._section_id:
+            self._section_id, self._offset = section_id, 0
+
+    def _sections(self) -> list[int]:
+        return sorted(int(path.name) for path in self._folder.glob("*"))
+
+    def _last_section(self) -> int | None:
+        return max(self._sections(), default=None)
+
+    def _new_lines_here(self) -> list[JournalLine]:
         try:
-            with open(self._path, "rb") as file:
+            with open(_path(self._folder, self._section_id), "rb") as file:
                 file.seek(self._offset)
                 data = file.read()
         except FileNotFoundError:
             return []
         whole = data.rfind(b"\n") + 1
         self._offset += whole
-        return [CommittedFrame.from_plain(json.loads(line)) for line in data[:whole].splitlines()]
+        return [_line_of(line) for line in data[:whole].splitlines()]
+
+
+def _path(folder: Path, section_id: int) -> Path:
+    return folder / f"{section_id:06d}"
+
+
+def _open_at_last_line(path: Path) -> int:
+    """A descriptor for appending; what is left of a line is cut off."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    whole = path.read_bytes().rfind(b"\n") + 1
+    os.ftruncate(descriptor, whole)
+    os.lseek(descriptor, whole, os.SEEK_SET)
+    return descriptor
+
+
+def _line_of(line: bytes) -> JournalLine:
+    plain = json.loads(line)
+    ended = plain.pop("ended", None)
+    return JournalLine(
+        frame=CommittedFrame.from_plain(plain),
+        ended=None if ended is None else CommitFacts.unpacked(ended.encode()),
+    )

@@ -1,8 +1,14 @@
 """The map store as a process that only reads it follows it: the last commit, and the map as of then."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
+import numpy.typing as npt
+
 from vtslam.common.frame import Frame
+from vtslam.common.overlap.coarse import CoarseDepth
+from vtslam.common.overlap.view_index import ViewFacts
 from vtslam.common.section import Section
 from vtslam.common.shm.active_reader import ActiveReader, PinnedActive
 from vtslam.common.shm.errors import GenerationGone, SectionNotResident
@@ -32,6 +38,27 @@ class StoreArchive:
             return _copied(held.section).retied()
         finally:
             held.release()
+
+    def view_depth(self, section_id: int, section_row: int) -> npt.NDArray[np.uint16]:
+        """The depth uint16 [H,W] that a finished section keeps of a frame: a copy."""
+        try:
+            held = self._store.pinned_sealed(section_id)
+        except SectionNotResident:
+            return self._elsewhere.view_depth(section_id, section_row)
+        try:
+            depth = held.section.frames[section_row].view_depth
+            assert depth is not None
+            return depth.copy()
+        finally:
+            held.release()
+
+    def coarse_depth(self, frame_id: int) -> CoarseDepth | None:
+        """See `ReadsSections`."""
+        return self._elsewhere.coarse_depth(frame_id)
+
+    def known_views(self, first_section_id: int, end_section_id: int) -> Iterable[ViewFacts]:
+        """See `ReadsSections`."""
+        return self._elsewhere.known_views(first_section_id, end_section_id)
 
 
 def _copied(section: Section) -> Section:

@@ -14,7 +14,6 @@ from vtslam.common.geometry import se3
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Rendering
-from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.engines import make_engine
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.storage.errors import RunFolderError
@@ -33,12 +32,11 @@ class RecordedRun:
         info: What the run was made with.
         settings: Its effective settings.
         source: Its recording, opened again.
-        rows: The facts per frame (``frames.jsonl``).
-        poses: float64 [F,4,4], the committed ``T_world_camera`` of frames 0 to F-1.
+        rows: The facts per frame.
+        poses: float64 [F,4,4], ``T_world_camera`` of frames 0 to F-1, by their newest version.
 
     Raises:
         StorageError: There is no run, or it cannot be read.
-        TrajectoryError: Its trajectory cannot be read.
         ConfigError: Its settings are refused, or its engine is not there.
         SourceError: Its source cannot be opened any more.
     """
@@ -51,7 +49,7 @@ class RecordedRun:
         self._engine = make_engine(self.settings.splat)
         self._archive = SectionArchive(self.folder)
         self.rows: list[dict[str, Any]] = self.folder.read_frames()
-        self.poses = read_trajectory(self.folder.trajectory_path).poses
+        self.poses = self.folder.catalog.poses()[1]
         self._check()
         self._frames_of = _ranges([row["section_id"] for row in self.rows])
 
@@ -102,15 +100,10 @@ class RecordedRun:
                 f"{facts.width}x{facts.height} that the run was made from, found {len(self.source)} of "
                 f"{size[0]}x{size[1]}"
             )
-        if len(self.poses) != len(self.rows):
-            raise RunFolderError(
-                f"{self.folder.path}: expected as many poses as frames, found {len(self.poses)} poses in "
-                f"{self.folder.trajectory_path.name} and {len(self.rows)} frames in frames.jsonl"
-            )
         if not self.rows:
             raise RunFolderError(f"{self.folder.path}: no frame was committed; nothing to evaluate")
         if [row.get("frame_id") for row in self.rows] != list(range(len(self.rows))):
-            raise RunFolderError(f"{self.folder.path}: frames.jsonl: expected frames 0, 1, 2, ... in order")
+            raise RunFolderError(f"{self.folder.path}: expected frames 0, 1, 2, ... in order, found others")
 
 
 def _ranges(section_ids: list[int]) -> dict[int, range]:

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Engine
+from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.engines import thread_count
 from vtslam.services.frame_facts import (
     FIRST_FRAME_STATE,
@@ -19,11 +21,14 @@ from vtslam.services.frame_facts import (
     frame_facts,
 )
 from vtslam.services.process_facts import peak_rss_mb
+from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.services.sensor.sources.base import Source, SourceError
 from vtslam.services.system import FrameReport, Seal, System
+from vtslam.services.tracker.state import TrackerState
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
+from vtslam.storage.section_record import SectionRecord
 
 
 def run_recording(
@@ -32,6 +37,7 @@ def run_recording(
     engine: Engine,
     run: RunFolder,
     *,
+    resume: ResumePoint | None = None,
     known_poses: npt.NDArray[np.float64] | None = None,
     on_frame: Callable[[FrameFacts], None] = lambda facts: None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -42,7 +48,8 @@ def run_recording(
         source: The recording.
         settings: The effective settings.
         engine: The rasteriser they ask for (`vtslam.services.engines.make_engine`).
-        run: An empty run folder, open for writing.
+        run: A run folder, open for writing; empty unless ``resume`` is given.
+        resume: Where to go on; from the beginning if None.
         known_poses: ``T_world_camera`` float64 [F,4,4] of all frames, to map at them without tracking.
         on_frame: Called after each frame.
         should_stop: Asked before each frame; True ends the run, and what was done is kept.
@@ -51,10 +58,10 @@ def run_recording(
         SourceError: A frame cannot be read; what was done before it is kept.
         StorageError: Something cannot be written.
     """
-    recorder = _Recorder(settings, engine, run)
+    recorder = _Recorder(settings, engine, run, resume)
     interrupted = False
     try:
-        for index in range(len(source)):
+        for index in range(0 if resume is None else resume.facts.num_frames, len(source)):
             interrupted = should_stop()
             if interrupted:
                 break
@@ -66,15 +73,31 @@ def run_recording(
     return recorder.close(finished=not interrupted, interrupted=interrupted)
 
 
-class _Recorder:
-    """The system, its run folder and the frames so far."""
+class _RecentArchive(SectionArchive):
+    """The run folder's sections, with the record of the last one written at hand."""
 
-    def __init__(self, settings: Settings, engine: Engine, run: RunFolder) -> None:
+    last: SectionRecord | None = None
+
+    def write(self, section: Section) -> None:
+        """See `SectionArchive.write`."""
+        self.last = self.written(section)
+
+
+class _Recorder:
+    """The system, its run folder and the frames of the open section."""
+
+    def __init__(self, settings: Settings, engine: Engine, run: RunFolder, resume: ResumePoint | None) -> None:
         self._start_s = time.perf_counter()
+        self._archive = _RecentArchive(run)
         self._system = System(
-            settings, engine, SectionArchive(run), threads=thread_count(settings.splat), clock=time.perf_counter
+            settings, engine, self._archive, threads=thread_count(settings.splat), clock=time.perf_counter
         )
         self._record = RunRecord(run)
+        self._report: FrameReport | None = None
+        if resume is not None:
+            facts = resume.facts
+            state = TrackerState.resumed(facts.committed_poses, resume.frame, facts.history, facts.exposure)
+            self._system.go_on_after(resume.section_id, num_frames=facts.num_frames, state=state)
 
     def frame(self, source: Source, index: int, known_T_world_camera: npt.NDArray[np.float64] | None) -> FrameFacts:
         """Read and process one frame."""
@@ -87,8 +110,9 @@ class _Recorder:
         self._record.add(
             CommittedFrame(facts=facts, capture_time_ns=frame.capture_time_ns, T_world_camera=T_world_camera)
         )
+        self._report = report
         if report.sealed is not None:
-            self._record.write()
+            self._commit()
         return facts
 
     def close(self, *, finished: bool, interrupted: bool) -> RunSummary:
@@ -97,11 +121,34 @@ class _Recorder:
         sealed, last = self._system.finish(), self._record.last()
         if sealed is not None and last is not None:
             self._record.add(replace(last, facts=_with_seal(last.facts, sealed, time.perf_counter() - start_s)))
+            self._commit()
         return self._record.finish(
             finished=finished,
             interrupted=interrupted,
             seconds=time.perf_counter() - self._start_s,
             peak_rss_mb=peak_rss_mb(),
+        )
+
+    def _commit(self) -> None:
+        """Make the section that was written last part of the run."""
+        assert self._archive.last is not None
+        self._record.commit(self._archive.last, self._boundary())
+
+    def _boundary(self) -> CommitFacts:
+        """What the run goes on from after the last frame."""
+        state, last = self._system.state, self._record.last()
+        assert last is not None
+        assert self._report is not None
+        poses, num_frames = state.committed_poses, self._record.num_frames
+        return CommitFacts(
+            num_frames=num_frames,
+            num_tracked=num_frames,
+            sequence=num_frames,
+            iterations=self._report.commit.iterations,
+            frame=last,
+            T_world_previous=poses[0] if len(poses) == 2 else None,
+            history=state.history(),
+            pixels_crc32=pixels_crc32(self._report.frame),
         )
 
 

@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.common.config import to_dict
+from vtslam.common.config import load, to_dict
 from vtslam.common.preset_loading import load_settings
 from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.frame_facts import FrameFacts
+from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import program_version, versions
 from vtslam.services.recording_run import run_recording
-from vtslam.services.run_record import RunSummary
+from vtslam.services.resume import ResumePoint, prepare_to_resume
+from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.services.sensor.sources.base import Source
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.services.supervisor.processes import LIVE_SOURCE
+from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.run_info import RunFacts, RunInfo
 
@@ -80,6 +84,46 @@ class RunPlan:
                 should_stop=should_stop,
             )
 
+    def resume(
+        self,
+        folder: Path,
+        *,
+        on_frame: Callable[[FrameFacts], None] = lambda facts: None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> RunSummary:
+        """Go on with a run that was cut off or stopped, in this process; see :func:`plan_resume`.
+
+        Raises:
+            StorageError: The folder cannot be read or written, or another process is writing it.
+            SourceError: A frame cannot be read; what was done before it is kept.
+        """
+        with RunFolder.open(folder, writable=True) as run:
+            point = self._prepared(run)
+            if self._is_complete(point):
+                return _closed(run)
+            return run_recording(
+                self.source, self.settings, self.engine, run, resume=point, on_frame=on_frame, should_stop=should_stop
+            )
+
+    def resume_in_fleet(self, folder: Path, hooks: "FleetHooks") -> RunSummary:
+        """As :meth:`resume`, each service a process of its own; raises as `execute_in_fleet`."""
+        from vtslam.services.supervisor.fleet_run import run_in_fleet
+
+        with RunFolder.open(folder, writable=True) as run:
+            point = self._prepared(run)
+            if self._is_complete(point):
+                return _closed(run)
+            return run_in_fleet(run, self.settings, hooks, resume=point)
+
+    def _is_complete(self, point: ResumePoint | None) -> bool:
+        return point is not None and point.facts.num_frames == len(self.source)
+
+    def _prepared(self, run: RunFolder) -> ResumePoint | None:
+        point = prepare_to_resume(run, self.source, section_length=self.settings.section.length)
+        done = 0 if point is None else point.facts.num_frames
+        run.catalog.add_event("resumed", f"after {done} frames, by vtslam {program_version()}")
+        return point
+
     def execute_in_fleet(self, folder: Path, hooks: "FleetHooks", *, overwrite: bool = False) -> RunSummary:
         """Make the run folder and run, each service a process of its own.
 
@@ -133,6 +177,37 @@ def plan_run(
     family = family or source.family
     settings = load_settings(preset=preset, family=family, file=config, assignments=assignments)
     return RunPlan(source=source, settings=settings, engine=make_engine(settings.splat), preset=preset, family=family)
+
+
+def plan_resume(folder: Path) -> RunPlan:
+    """What a run folder's own settings and source say, to go on with it.
+
+    Raises:
+        StorageError: There is no run, or it was fed by publishers, whose frames are gone.
+        ConfigError: Its settings are refused.
+        SourceError: Its source cannot be opened any more, or is not as long or large as it was.
+    """
+    info = RunFolder.open(folder).read_info()
+    facts = info.facts
+    if facts.source == LIVE_SOURCE:
+        raise RunFolderError(f"{folder}: publishers fed this run, and their frames are gone; it cannot be resumed")
+    settings: Settings = load(Settings, [(f"{folder / 'run.toml'} [settings]", info.settings)])
+    if pace_of(settings.fleet, live=False).is_realtime:
+        raise RunFolderError(f"{folder}: this run dropped frames to keep up with time; it cannot be resumed")
+    source = open_source(facts.source)
+    found = (source.camera.width, source.camera.height, len(source))
+    if found != (facts.width, facts.height, facts.end_frame):
+        raise RunFolderError(
+            f"{folder}: {facts.source}: expected the {facts.end_frame} frames of {facts.width}x{facts.height} "
+            f"that the run is made from, found {found[2]} of {found[0]}x{found[1]}"
+        )
+    engine = make_engine(settings.splat)
+    return RunPlan(source=source, settings=settings, engine=engine, preset=facts.preset, family=facts.family)
+
+
+def _closed(run: RunFolder) -> RunSummary:
+    """A run of which every frame is durable."""
+    return RunRecord(run).finish(finished=True, interrupted=False, seconds=0.0, peak_rss_mb=0.0)
 
 
 def _source_options(settings: SourceSettings) -> dict[str, str]:

@@ -84,6 +84,18 @@ class System:
         self._state = TrackerState()
         self._frames = 0
 
+    @property
+    def state(self) -> TrackerState:
+        """What the tracker carries to the next frame."""
+        return self._state
+
+    def go_on_after(self, section_id: int, *, num_frames: int, state: TrackerState) -> None:
+        """Begin at the end of a sealed section, with the tracker's state there, instead of at the first frame."""
+        assert self._frames == 0
+        assert num_frames == (section_id + 1) * self.settings.section.length
+        self.map.sealed(self._archive.read(section_id))
+        self._frames, self._state = num_frames, state
+
     def process(
         self,
         frame: Frame,

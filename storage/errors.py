@@ -21,6 +21,10 @@ class WriteFailed(StorageError):
     """The operating system refused to write: a full disk, a missing permission."""
 
 
+class DiskFull(WriteFailed):
+    """There is no room, or no more of the user's share; what was stored before is as it was."""
+
+
 class BadMagic(StorageError):
     """The file is of another kind."""
 
@@ -39,6 +43,10 @@ class ChecksumMismatch(StorageError):
 
 class MalformedSection(StorageError):
     """Checksums fit, yet a name, type, size, order, value or range breaks the format."""
+
+
+class CatalogError(StorageError):
+    """The catalogue of a run cannot be read or written, or does not hold what it should."""
 
 
 class RunFolderError(StorageError):

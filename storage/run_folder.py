@@ -1,34 +1,51 @@
-"""The folder that a run leaves on disk (RUN): what it was made with, its trajectory, its sections, facts per frame.
+"""The folder that a run leaves on disk (RUN): what it was made with, its catalogue, its sections, its trajectory.
 
 ::
 
     RUN/run.toml             effective settings, versions, source
-    RUN/trajectory.txt       TUM format
-    RUN/frames.jsonl         one JSON object a frame: quality and timing
+    RUN/catalog.sqlite       what is durable: sections, frames, poses, candidate views, events (docs/format-run.md)
     RUN/sections/000042.vts  a finished section (docs/format-section.md)
+    RUN/trajectory.txt       TUM format; made from the catalogue, longer with each section
+    RUN/damaged/             files that were set aside
     RUN/lock                 held by the one process that writes the run
 
-Every file is replaced as a whole, so a run that was cut off is still a readable run.
+A section is durable once the catalogue names it, which happens after its file is on disk and verified. So a run that
+was cut off, also by a power cut, is still a readable run.
 """
 
 import fcntl
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from vtslam.storage.atomic import is_temporary, replace_file, sweep_temporaries, sync_folder
-from vtslam.storage.dense_section import DenseGrid
-from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked, WriteFailed
-from vtslam.storage.frame_rows import read_rows, write_rows
+import numpy as np
+import numpy.typing as npt
+
+from vtslam.common.trajectory_io import trajectory_text
+from vtslam.storage.atomic import (
+    append_to_file,
+    is_temporary,
+    remove_files,
+    replace_file,
+    sweep_temporaries,
+    sync_folder,
+    write_failed,
+)
+from vtslam.storage.catalog import Catalog
+from vtslam.storage.catalog_rows import FrameRow, SectionRow
+from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked
 from vtslam.storage.run_info import RunInfo, read_run_info
 from vtslam.storage.section_codecs import SectionCodec
-from vtslam.storage.section_file import read_section, repack_section, write_section
+from vtslam.storage.section_facts import file_facts
+from vtslam.storage.section_file import read_columns, read_section, write_section
 from vtslam.storage.section_record import SectionRecord
 
-_INFO, _TRAJECTORY, _FRAMES, _SECTIONS, _LOCK = "run.toml", "trajectory.txt", "frames.jsonl", "sections", "lock"
+_INFO, _CATALOG, _TRAJECTORY, _SECTIONS, _LOCK = "run.toml", "catalog.sqlite", "trajectory.txt", "sections", "lock"
+WRITTEN_CODEC: SectionCodec = "lossless"  # of sections as a run writes them
+_CATALOG_FILES = (_CATALOG, f"{_CATALOG}-wal", f"{_CATALOG}-shm")
 _DERIVED = ("metrics.json", "report.json")  # made from a run; wrong beside another one
 _SECTION_NAME = re.compile(r"(\d{6}|[1-9]\d{6,})\.vts")
 
@@ -43,6 +60,7 @@ class RunFolder:
     def __init__(self, path: Path, lock: int | None) -> None:
         self.path = path
         self._lock = lock  # descriptor that holds the lock; None: for reading
+        self._catalog: Catalog | None = None
 
     @classmethod
     def create(cls, path: Path, info: RunInfo, *, overwrite: bool = False) -> Self:
@@ -64,11 +82,13 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
             lock = _take_lock(path)
         except OSError as error:
-            raise WriteFailed(f"{path}: cannot make a run folder: {error.strerror}") from error
+            raise write_failed(path, error) from error
         run = cls(path, lock)
         try:
             _refuse_unless_free(path, overwrite)  # again: another process may have been here before the lock
             run._clear()
+            run._catalog = Catalog.create(path / _CATALOG)
+            sync_folder(path)
             run.write_info(info)
         except BaseException:
             run.close()
@@ -83,23 +103,31 @@ class RunFolder:
             RunFolderError: There is no run in ``path``.
             RunLocked: Another process is writing it.
             WriteFailed: The operating system refused the lock.
+            StorageError: For writing: the catalogue cannot be opened; see `Catalog.open`.
         """
         if not (path / _INFO).is_file():
             raise RunFolderError(f"{path}: not a run folder: expected {path / _INFO}, found none")
-        if not writable:
-            return cls(path, None)
         run = cls(path, None)
+        if not writable:
+            return run
         try:
             run._lock = _take_lock(path)
+            run._catalog = Catalog.open(path / _CATALOG, writable=True)
             sweep_temporaries(path)
             sweep_temporaries(path / _SECTIONS)
         except OSError as error:
             run.close()
-            raise WriteFailed(f"{path}: cannot open for writing: {error.strerror}") from error
+            raise write_failed(path, error) from error
+        except BaseException:
+            run.close()
+            raise
         return run
 
     def close(self) -> None:
-        """Give the lock back; reading stays possible."""
+        """Give the catalogue and the lock back; reading stays possible."""
+        if self._catalog is not None:
+            self._catalog.close()
+            self._catalog = None
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
@@ -124,18 +152,33 @@ class RunFolder:
         replace_file(self.path / _INFO, [info.as_toml().encode()])
 
     @property
+    def catalog(self) -> Catalog:
+        """The catalogue, opened when it is asked for; raises as `Catalog.open`."""
+        if self._catalog is None:
+            self._catalog = Catalog.open(self.path / _CATALOG)
+        return self._catalog
+
+    @property
     def trajectory_path(self) -> Path:
         """Where the trajectory is, or will be."""
         return self.path / _TRAJECTORY
 
-    def write_frames(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Replace the facts per frame; see :func:`vtslam.storage.frame_rows.write_rows`."""
+    def write_trajectory(self) -> None:
+        """Make the trajectory anew from the catalogue, if it is not what it should be."""
         self._require_writable()
-        write_rows(self.path / _FRAMES, rows)
+        times_ns, poses = self.catalog.poses()
+        text = trajectory_text(times_ns.tolist(), poses).encode("ascii")
+        if not self.trajectory_path.is_file() or self.trajectory_path.read_bytes() != text:
+            replace_file(self.trajectory_path, [text])
 
     def read_frames(self) -> list[dict[str, Any]]:
-        """The facts per frame; raises RunFolderError."""
-        return read_rows(self.path / _FRAMES)
+        """The facts per frame; raises StorageError."""
+        return [dict(frame.facts) for frame in self.catalog.frames()]
+
+    def remove_derived(self) -> None:
+        """Delete figures that were made of the run, because it goes on."""
+        self._require_writable()
+        remove_files(self.path / name for name in _DERIVED)
 
     # --- sections ---------------------------------------------------------------------------------------------------
 
@@ -149,7 +192,7 @@ class RunFolder:
         return sorted(int(name[1]) for name in names if name)
 
     def write_section(self, record: SectionRecord) -> Path:
-        """Write a finished section, durable and verified; where it is.
+        """Write a finished section, durable and verified; where it is. It counts once it is in the catalogue.
 
         Raises:
             RunFolderError: The section is already there; a finished section never changes.
@@ -159,8 +202,60 @@ class RunFolder:
         path = self.section_path(record.section_id)
         if path.exists():
             raise RunFolderError(f"{path}: section {record.section_id} is already written; it never changes")
-        write_section(path, record)
+        write_section(path, record, WRITTEN_CODEC)
         return path
+
+    def commit_section(
+        self,
+        record: SectionRecord,
+        frames: Sequence[FrameRow],
+        *,
+        resume: bytes | None = None,
+        codec: SectionCodec = WRITTEN_CODEC,
+    ) -> None:
+        """Enter a written section in the catalogue, from when on it counts, and lengthen the trajectory.
+
+        Args:
+            record: The section that was written.
+            frames: All its frames, in order.
+            resume: What a run goes on from after it.
+            codec: Of its file.
+
+        Raises:
+            StorageError: It cannot be written; if that is the trajectory, the section counts nevertheless.
+        """
+        self._require_writable()
+        file = file_facts(self.section_path(record.section_id))
+        row = SectionRow(
+            section_id=record.section_id,
+            first_frame_id=int(record.frame_ids[0]),
+            num_frames=record.num_frames,
+            num_gaussians=record.num_gaussians,
+            camera=record.camera,
+            depth_scale_m=record.depth_scale_m,
+            num_bytes=file.num_bytes,
+            sha256=file.sha256,
+            codec=codec,
+        )
+        self.catalog.add_section(record, row, frames, resume=resume)
+        self._lengthen_trajectory(frames)
+
+    def add_loose_frames(self, section_id: int, frames: Sequence[FrameRow]) -> None:
+        """Keep the poses and facts of frames whose section will never be on disk; raises StorageError."""
+        self._require_writable()
+        self.catalog.add_loose_frames(section_id, frames)
+        self._lengthen_trajectory(frames)
+
+    def _lengthen_trajectory(self, frames: Sequence[FrameRow]) -> None:
+        times_ns, poses = [frame.capture_time_ns for frame in frames], [frame.T_world_camera for frame in frames]
+        append_to_file(self.trajectory_path, trajectory_text(times_ns, np.stack(poses)).encode("ascii"))
+
+    def drop_sections(self, first_section_id: int) -> None:
+        """Forget a section and all later ones, and delete their files and those that the catalogue does not name."""
+        self._require_writable()
+        self.catalog.drop_from(first_section_id)
+        remove_files(self.section_path(each) for each in self.section_ids() if each >= first_section_id)
+        self.write_trajectory()
 
     def read_section(self, section_id: int) -> SectionRecord:
         """A section from disk, every byte checked; raises StorageError."""
@@ -170,19 +265,10 @@ class RunFolder:
             raise MalformedSection.differing(path, "section_id", expected=section_id, found=record.section_id)
         return record
 
-    def repack_sections(self, codec: SectionCodec, grid: DenseGrid | None = None) -> None:
-        """Bring every section's file into ``codec``, one after another, each replaced as a whole.
-
-        Args:
-            codec: The codec; files that have it stay as they are.
-            grid: What ``dense`` rounds to; None for the usual grid.
-
-        Raises:
-            StorageError: A section cannot be read or written; it and those after it are as they were.
-        """
-        self._require_writable()
-        for section_id in self.section_ids():
-            repack_section(self.section_path(section_id), codec, grid)
+    def read_views(self, section_id: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
+        """Rows [V] of the frames that a section keeps the depth of, and that depth [V,H,W]; raises StorageError."""
+        _, columns = read_columns(self.section_path(section_id), ["view_index", "view_depth"])
+        return columns["view_index"], columns["view_depth"]
 
     def _require_writable(self) -> None:
         if self._lock is None:
@@ -197,12 +283,12 @@ class RunFolder:
             sweep_temporaries(sections)
             for section_id in self.section_ids():
                 self.section_path(section_id).unlink()
-            for name in (_TRAJECTORY, _FRAMES, *_DERIVED):
+            for name in (_TRAJECTORY, *_CATALOG_FILES, *_DERIVED):
                 (self.path / name).unlink(missing_ok=True)
             sync_folder(sections)
             sync_folder(self.path)
         except OSError as error:
-            raise WriteFailed(f"{self.path}: cannot clear the folder: {error.strerror}") from error
+            raise write_failed(self.path, error) from error
 
 
 def _refuse_unless_free(path: Path, overwrite: bool) -> None:
@@ -222,7 +308,7 @@ def _is_own_leftover(entry: Path) -> bool:
     """Whether an entry of a folder without ``run.toml`` is what a crash while making a run leaves."""
     if entry.name == _SECTIONS and entry.is_dir():
         return all(is_temporary(inner) for inner in entry.iterdir())
-    return entry.name == _LOCK or is_temporary(entry)
+    return entry.name in (_LOCK, *_CATALOG_FILES) or is_temporary(entry)
 
 
 def _take_lock(path: Path) -> int:

@@ -1,9 +1,15 @@
 """Sections of the map as section files keep them, and back: nothing is lost, positions are computed anew."""
 
+from collections import OrderedDict
+from collections.abc import Iterable
+
 import numpy as np
+import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
 from vtslam.common.gaussians import ViewTiedGaussians
+from vtslam.common.overlap.coarse import CoarseDepth
+from vtslam.common.overlap.view_index import ViewFacts
 from vtslam.common.section import Section, SectionFrame
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_record import SectionRecord
@@ -73,16 +79,52 @@ def section_of(record: SectionRecord) -> Section:
     ).retied()
 
 
+_VIEW_BYTES = 24 * 10**6  # depth of candidate views kept in memory
+
+
 class SectionArchive:
     """Sealed sections in a run folder."""
 
     def __init__(self, run: RunFolder) -> None:
         self._run = run
+        self._views: OrderedDict[tuple[int, int], npt.NDArray[np.uint16]] = OrderedDict()
+        self._view_bytes = 0
 
     def write(self, section: Section) -> None:
         """Keep a sealed section, durable and verified; raises StorageError."""
-        self._run.write_section(record_of(section))
+        self.written(section)
+
+    def written(self, section: Section) -> SectionRecord:
+        """As :meth:`write`; what was written."""
+        record = record_of(section)
+        self._run.write_section(record)
+        return record
 
     def read(self, section_id: int) -> Section:
         """A section written before; raises StorageError."""
         return section_of(self._run.read_section(section_id))
+
+    def view_depth(self, section_id: int, section_row: int) -> npt.NDArray[np.uint16]:
+        """The depth uint16 [H,W] that a section keeps of a frame; the last ones are at hand. Raises StorageError."""
+        key = (section_id, section_row)
+        if key not in self._views:
+            self._read_views(section_id)
+        self._views.move_to_end(key)
+        return self._views[key]
+
+    def coarse_depth(self, frame_id: int) -> CoarseDepth | None:
+        """The coarse depth of a frame of a section on disk; None if it is not kept. Raises StorageError."""
+        return self._run.catalog.coarse_depth(frame_id)
+
+    def known_views(self, first_section_id: int, end_section_id: int) -> Iterable[ViewFacts]:
+        """The frames that keep their depth of sections on disk, of a range. Raises StorageError."""
+        return self._run.catalog.views(first_section_id, end_section_id)
+
+    def _read_views(self, section_id: int) -> None:
+        rows, depth = self._run.read_views(section_id)
+        for row, image in zip(rows.tolist(), depth, strict=True):
+            if (section_id, row) not in self._views:
+                self._views[section_id, row] = image.copy()  # apart from each other, so that one may go
+                self._view_bytes += image.nbytes
+        while self._view_bytes > _VIEW_BYTES and len(self._views) > len(rows):
+            self._view_bytes -= self._views.popitem(last=False)[1].nbytes

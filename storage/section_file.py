@@ -24,7 +24,7 @@ from vtslam.storage.errors import (
     UnreadableFile,
     UnsupportedVersion,
 )
-from vtslam.storage.section_codecs import SectionCodec, codec_of_header, decoded_record, encoded_record
+from vtslam.storage.section_codecs import SectionCodec, decoded_record, encoded_record
 from vtslam.storage.section_encoding import encoded_columns
 from vtslam.storage.section_layout import (
     CRC,
@@ -308,21 +308,6 @@ def read_section(path: Path) -> SectionRecord:
     """
     with _open(path) as file:
         return _section_in(file, path)
-
-
-def repack_section(path: Path, codec: SectionCodec, grid: DenseGrid | None = None) -> bool:
-    """Replace a section's file by one in another codec, as a whole; whether it was not in that codec already.
-
-    What ``fast`` or ``dense`` rounded stays rounded. ``grid`` is what ``dense`` rounds to, None the usual one.
-
-    Raises:
-        StorageError: It cannot be read or written, and is as it was.
-    """
-    header, columns = read_columns(path)
-    if codec_of_header(header) == codec:
-        return False
-    write_section(path, _record(path, header, columns), codec, grid)
-    return True
 
 
 def _section_pieces(

@@ -67,24 +67,41 @@ def seen_by_view(
     Returns:
         bool [N].
     """
+    columns = np.ascontiguousarray(points_world_m.T)
+    return seen_columns(columns, T_world_view, view_depth, depth_scale_m, camera, tolerance, border_px)
+
+
+def seen_columns(
+    points_world_m: npt.NDArray[np.float64],
+    T_world_view: npt.NDArray[np.float64],
+    view_depth: npt.NDArray[np.uint16 | np.float32],
+    depth_scale_m: float,
+    camera: Camera,
+    tolerance: float,
+    border_px: float,
+) -> npt.NDArray[np.bool_]:
+    """As `seen_by_view`, of points float64 [3,N]; of each as if it were asked about alone."""
     T = se3.inverse(T_world_view)
-    local = points_world_m @ T[:3, :3].T + T[:3, 3]
-    in_front = local[:, 2] > 0.0
-    z = np.where(in_front, local[:, 2], 1.0)
-    u = camera.fx * local[:, 0] / z + camera.cx
-    v = camera.fy * local[:, 1] / z + camera.cy
+    p = points_world_m
+    # Written out: a matrix product may round differently with more points, or fewer.
+    x, y, depth_m = (row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3] for row in T[:3])
+    in_front = depth_m > 0.0
+    z = np.where(in_front, depth_m, 1.0)
+    u = camera.fx * x / z + camera.cx
+    v = camera.fy * y / z + camera.cy
     inside = in_front & (u >= border_px) & (v >= border_px)
     inside &= (u < camera.width - border_px) & (v < camera.height - border_px)
-    out = np.zeros(points_world_m.shape[0], np.bool_)
+    out = np.zeros(inside.size, np.bool_)
     rows = np.flatnonzero(inside)
     if rows.size:
+        z = z[rows]
         measured = _bilinear(view_depth, u[rows] - 0.5, v[rows] - 0.5) * depth_scale_m
-        out[rows] = np.abs(measured - z[rows]) < tolerance * np.minimum(measured, z[rows])
+        out[rows] = np.abs(measured - z) < tolerance * np.minimum(measured, z)
     return out
 
 
 def _bilinear(
-    image: npt.NDArray[np.uint16], x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]
+    image: npt.NDArray[np.uint16 | np.float32], x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     """Samples [N] of an image at integer-centred coordinates; zeros outside."""
     # cv2.remap takes maps of at most 32767 rows: shape them as a wide image.
@@ -93,7 +110,9 @@ def _bilinear(
     flat = np.full((2, rows * columns), -10.0, np.float32)
     flat[0, : x.size], flat[1, : x.size] = x, y
     maps = flat.reshape(2, rows, columns)
-    sampled = cv2.remap(image.astype(np.float32), maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    sampled = cv2.remap(
+        image.astype(np.float32, copy=False), maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    )
     return np.asarray(sampled, np.float64).reshape(-1)[: x.size]
 
 

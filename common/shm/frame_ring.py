@@ -97,8 +97,13 @@ class FrameRingWriter(_Ring):
         self._state = state or self._control.state
 
     @classmethod
-    def create(cls, path: Path, spec: RingSpec) -> "FrameRingWriter":
+    def create(cls, path: Path, spec: RingSpec, *, acknowledged: int = 0) -> "FrameRingWriter":
         """Make a ring with all its memory reserved.
+
+        Args:
+            path: Where.
+            spec: Its size.
+            acknowledged: Frames before its first one, which are done with.
 
         Raises:
             SharedMemoryFull: There is not enough.
@@ -111,7 +116,12 @@ class FrameRingWriter(_Ring):
         try:
             reserve(new, fd, 0, spec.file_bytes)
             sizes = np.array([(spec.width, spec.height, spec.slots, spec.pins)], DESCRIPTION)
-            ControlPage.write(new, fd, Kind.RING, file_bytes=spec.file_bytes, pins=spec.pins, description=sizes)
+            control = ControlPage.write(
+                new, fd, Kind.RING, file_bytes=spec.file_bytes, pins=spec.pins, description=sizes
+            )
+            if acknowledged:
+                control.publish(control.state, State(epoch=1, number=acknowledged, buffer=0))
+                control.words.store(_W_ACKNOWLEDGED, acknowledged)
             new.rename(path)
         except BaseException:
             new.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vtslam.common import failpoints
+from vtslam.common.frame import Frame
 from vtslam.common.section import Section
 from vtslam.common.shm.active_reader import ActiveReader, PinnedActive
 from vtslam.common.shm.active_writer import ActiveWriter, make_active_block
@@ -182,6 +183,22 @@ class MapStore:
             except FileExistsError as error:
                 raise SharedMemoryError(f"{path}: a sealed section never changes, and this one is there") from error
             new.unlink()
+
+    def restore(self, section: Section, last: Frame, facts: bytes) -> None:
+        """Begin an empty store with a section from disk, as if it had been sealed here.
+
+        Args:
+            section: The section.
+            last: The frame of its last row.
+            facts: What was committed with it.
+
+        Raises:
+            MapStoreFull, SharedMemoryFull: No memory.
+        """
+        row, tail = len(section.frames) - 1, self._path("tail", section.section_id)
+        with self._removed_on_failure(tail):
+            write_tail(tail, section.section_id, row, last, facts, self._admit)
+            self.put_sealed(section)
 
     def unlink_sealed(self, section_id: int, *, verified_on_disk: bool) -> None:
         """Let a sealed section leave memory; nothing happens if it is not there.

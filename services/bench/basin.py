@@ -16,7 +16,7 @@ from vtslam.common.geometry import se3
 from vtslam.common.section import Section
 from vtslam.services.engines import thread_count
 from vtslam.services.run_plan import RunPlan
-from vtslam.services.section_map import SectionMap
+from vtslam.services.section_map import ReadsSections, SectionMap
 from vtslam.services.system import System
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.state import TrackerState
@@ -27,7 +27,7 @@ _TRACKED_FRAMES = 3
 _SEED = 7
 
 
-class _NoArchive:
+class _NoArchive(ReadsSections):
     """The section under test is never sealed."""
 
     def write(self, section: Section) -> None:

@@ -22,6 +22,7 @@ def parser() -> argparse.ArgumentParser:
     _add_publish(commands)
     _add_status(commands)
     _add_eval(commands)
+    _add_sections(commands)
     _add_bench(commands)
     _add_settings(commands)
     _add_doctor(commands)
@@ -62,14 +63,20 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         "track and map a recording",
         example="vtslam run replica:DIR --size 320x240 --frames 0:120 --out RUN",
     )
-    command.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    command.add_argument("source", nargs="?", metavar="SOURCE", help=SOURCE_HELP)
     command.add_argument(
         "--in-process",
         action="store_true",
         help="one process for all services; the result is that of lockstep",
     )
-    command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
+    command.add_argument("--out", type=Path, metavar="RUN", help="run folder to make")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    command.add_argument(
+        "--resume",
+        type=Path,
+        metavar="RUN",
+        help="go on with a run that was cut off or stopped, with its own source and settings",
+    )
     _add_pacing(command, default="lockstep")
     _add_layers(command)
     _add_source_shorthands(command)
@@ -124,6 +131,24 @@ def _add_eval(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 
+def _add_sections(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "sections",
+        "list, verify, repair or repack the sections of a run",
+        example="vtslam sections verify RUN",
+    )
+    actions = command.add_subparsers(dest="action", metavar="WHAT", required=True)
+    actions.add_parser("ls", help="what is there, from the catalogue")
+    actions.add_parser("verify", help="read every section and hold it against the catalogue")
+    actions.add_parser("repair", help="finish what was cut off, set damaged files aside (RUN/damaged)")
+    repack = actions.add_parser("repack", help="write all sections anew with another codec")
+    repack.add_argument("--codec", default="dense", metavar="NAME", help="the codec (default: %(default)s)")
+    for action in actions.choices.values():
+        action.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+        action.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
 def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command = _command(
         commands,
@@ -167,12 +192,15 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     chaos.add_argument(
         "source", nargs="?", default="sim:room?frames=120&size=160x120", metavar="SOURCE", help="default: %(default)s"
     )
+    overlap = kinds.add_parser("overlap", help="choosing overlapping sections on a long road")
+    overlap.add_argument("--views", type=int, default=100_000, metavar="N", help="along it (default: %(default)s)")
+    overlap.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
     for kind in (track, mapping, system, basin, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     for kind in (track, mapping, system, basin, codec, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, track, mapping, system, basin, codec, fleet, chaos):
+    for kind in (splat, overlap, track, mapping, system, basin, codec, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

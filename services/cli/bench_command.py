@@ -5,12 +5,14 @@ from argparse import Namespace
 from pathlib import Path
 
 from vtslam.common.config import ConfigError
+from vtslam.common.preset_loading import load_settings
 from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
 from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.codec import bench_codec, steps
 from vtslam.services.bench.codec_picture import write_codec_picture
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
 from vtslam.services.bench.fleet import PARTS, FleetBench, bench_fleet
+from vtslam.services.bench.overlap import HEADS, bench_overlap
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.cli.console import Console, Progress
@@ -37,8 +39,15 @@ def bench_command(args: Namespace) -> int:
 
 
 def _measured(args: Namespace) -> dict[str, object]:
-    own = {"splat": _splat, "basin": _basin, "codec": _codec, "chaos": _chaos, "fleet": _fleet}
-    return own.get(args.bench, _recording)(args)
+    kinds = {
+        "splat": _splat,
+        "basin": _basin,
+        "codec": _codec,
+        "chaos": _chaos,
+        "fleet": _fleet,
+        "overlap": _overlap,
+    }
+    return kinds.get(args.bench, _recording)(args)
 
 
 def _splat(args: Namespace) -> dict[str, object]:
@@ -48,6 +57,14 @@ def _splat(args: Namespace) -> dict[str, object]:
         )
     with Progress(args.repeats, what="measuring", unit="repeat") as progress:
         return bench_splat(_size(args.size), threads=args.threads, repeats=args.repeats, on_step=progress.step)
+
+
+def _overlap(args: Namespace) -> dict[str, object]:
+    if args.views < 1000:
+        raise ConfigError(f"bench overlap: expected --views of at least 1000, found {args.views}")
+    tracker = load_settings(preset="fast", family="kitti", file=None, assignments=[]).tracker
+    with Progress(HEADS, what="choosing", unit="head") as progress:
+        return bench_overlap(_size(args.size), views=args.views, tracker=tracker, on_step=progress.step)
 
 
 def _basin(args: Namespace) -> dict[str, object]:

@@ -61,6 +61,10 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.eval_command import eval_command
 
             return eval_command(args)
+        case "sections":
+            from vtslam.services.cli.sections_command import sections_command
+
+            return sections_command(args)
         case "bench":
             from vtslam.services.cli.bench_command import bench_command
 

@@ -10,26 +10,66 @@ from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.pacing import Pacing
-from vtslam.services.run_plan import RunPlan, plan_run
+from vtslam.services.run_plan import RunPlan, plan_resume, plan_run
 from vtslam.services.run_record import RunSummary
+from vtslam.storage.errors import WriteFailed
 
 
 def run_command(args: Namespace) -> int:
     """Run as the arguments say; the exit status."""
     console = Console(args.json)
-    plan = plan_run(
-        args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
-    )
+    out = _checked_out(args)
+    plan = plan_resume(out) if args.resume else _plan(args)
     pacing = plan.settings.fleet.pacing
     if args.in_process and pacing not in ("", Pacing.LOCKSTEP):
         raise ConfigError(f"--in-process works in lockstep, expected no other pacing, found {pacing}")
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
-        watched = watched_run if args.in_process else watched_fleet
-        summary = watched(plan, args.out, stop, overwrite=args.overwrite)
-    console.print(f"{summary_text(summary)}\nrun folder: {args.out}   (next: vtslam eval {args.out})")
-    console.result({"run": str(args.out.resolve()), "source": plan.source.uri, **asdict(summary)})
+        try:
+            summary = _watched(args, plan, out, stop)
+        except WriteFailed as error:
+            raise type(error)(f"{error}; what was stored is kept: vtslam run --resume {out}") from error
+    console.print(f"{summary_text(summary)}\nrun folder: {out}   (next: vtslam eval {out})")
+    console.result({"run": str(out.resolve()), "source": plan.source.uri, **asdict(summary)})
     return stop.exit_status if summary.interrupted else 0
+
+
+def _checked_out(args: Namespace) -> Path:
+    """The run folder, if the arguments go together."""
+    out: Path | None = args.resume or args.out
+    if args.resume is None and (args.source is None or out is None):
+        raise ConfigError("run: expected SOURCE and --out RUN, or --resume RUN")
+    if args.resume is not None and (args.source or args.out or args.overwrite or args.config or assignments_of(args)):
+        raise ConfigError(
+            f"run: --resume {args.resume} goes on with the run's own source and settings; it takes --in-process and "
+            "--json only"
+        )
+    assert out is not None
+    return out
+
+
+def _plan(args: Namespace) -> RunPlan:
+    return plan_run(
+        args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
+    )
+
+
+def _watched(args: Namespace, plan: RunPlan, out: Path, stop: StopRequest) -> RunSummary:
+    if args.resume:
+        return _watched_resume(plan, out, stop, in_process=args.in_process)
+    watched = watched_run if args.in_process else watched_fleet
+    return watched(plan, out, stop, overwrite=args.overwrite)
+
+
+def _watched_resume(plan: RunPlan, out: Path, stop: StopRequest, *, in_process: bool) -> RunSummary:
+    """Go on with a run, with progress as in a whole one."""
+    from vtslam.services.supervisor.fleet_run import FleetHooks
+
+    with Progress(len(plan.source), what="mapping", unit="frame") as progress:
+        watch = FrameWatch(progress)
+        if in_process:
+            return plan.resume(out, on_frame=watch, should_stop=stop)
+        return plan.resume_in_fleet(out, FleetHooks(on_frame=watch, on_event=progress.note, should_stop=stop))
 
 
 def watched_run(

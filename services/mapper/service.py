@@ -18,7 +18,7 @@ from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.shm.sealed_block import sealed_bytes
 from vtslam.common.splat.engine import Engine
 from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED
-from vtslam.services.commit_facts import CommitFacts
+from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.frame_facts import FIRST_FRAME_STATE, CommittedFrame, Seconds, frame_facts
 from vtslam.services.frame_journal import JournalWriter
 from vtslam.services.mapper.pose_intake import EveryPose, NewestPose, PoseIntake
@@ -212,6 +212,7 @@ class MapperService:
             ),
             T_world_previous=None if self._facts is None else self._facts.frame.T_world_camera,
             history=pose.history,
+            pixels_crc32=pixels_crc32(frame),
         )
 
     def _commit(self, mapped: _Mapped) -> float:
@@ -294,11 +295,12 @@ class MapperService:
         """Tell of the last commit; harmless if that was done before."""
         self._untold = facts
         try:
-            self._journal.append(facts.frame)
+            self._journal.append(facts, section_ended=self._active is None)
         except SharedMemoryFull as error:
             return self._wait_for_room(error)
         self._untold = self._no_room_since_ns = None
-        self._open_ring().acknowledge(facts.sequence)
+        if self._paths.ring.exists():  # when a run is resumed, it is made later, and made so that this holds
+            self._open_ring().acknowledge(facts.sequence)
         frame, about = facts.frame, facts.frame.facts
         self._committed.publish(
             FrameCommitted(

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.frame import Frame
-from vtslam.common.overlap.selection import CandidateView, largest_overlap, overlap_shares, world_points_m
+from vtslam.common.overlap.search import OverlapSearch
+from vtslam.common.overlap.view_index import ViewIndex
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Engine
@@ -23,7 +24,7 @@ class MapReader(Protocol):
         """A section, loaded if it is not at hand."""
         ...
 
-    def candidate_views(self) -> list[CandidateView]:
+    def candidate_views(self) -> ViewIndex:
         """All candidate views, in order of time."""
         ...
 
@@ -94,9 +95,7 @@ class MapperTurns:
             return []
         tracker = self._settings.tracker
         overlap = replace(tracker.overlap, depth_consistency=tracker.visibility_tolerance)
-        views = self._map.candidate_views()
-        points = world_points_m(frame, T_world_camera, frame.depth > 0)
-        shares = overlap_shares(points, views, overlap)
-        overlapping = largest_overlap(shares, views, excluded_section_id=section_id - 1)
+        search = OverlapSearch(self._map.candidate_views(), frame, T_world_camera, overlap)
+        overlapping = search.largest_overlap(excluded_section_id=section_id - 1)
         ids = [section_id - 1] if overlapping is None else [section_id - 1, overlapping]
         return [self._map.section(i) for i in ids]

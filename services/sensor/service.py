@@ -23,13 +23,23 @@ class RecordingSensor:
         source: The recording; after a restart frames that the ring does not have are read again.
         ring_path: Where the ring is, or will be.
         credit: Frames that may be in the ring without being committed.
+        frames_before: Frames that an earlier part of the run has mapped.
     """
 
-    def __init__(self, bus: Bus, link: ServiceLink, source: Source, ring_path: Path, *, credit: int = 2) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        link: ServiceLink,
+        source: Source,
+        ring_path: Path,
+        *,
+        credit: int = 2,
+        frames_before: int = 0,
+    ) -> None:
         self._link, self._source, self._credit = link, source, credit
         self._frames = bus.publisher(SENSOR_FRAME)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
-        self._ring = _open_ring(ring_path, source, credit)
+        self._ring = _open_ring(ring_path, source, credit, frames_before)
         self._next = self._ring.published  # frames are numbered from 0, the ring's sequence from 1
         self._read: tuple[Frame, float] | None = None
         self._announce_again(FrameRingReader(ring_path))
@@ -63,11 +73,11 @@ class RecordingSensor:
         self._frames.publish(descriptor_message(frame, descriptor, epoch=self._link.epoch, read_s=read_s))
 
 
-def _open_ring(path: Path, source: Source, credit: int) -> FrameRingWriter:
+def _open_ring(path: Path, source: Source, credit: int, frames_before: int) -> FrameRingWriter:
     """The fleet's ring, taken over from a sensor that died if there was one."""
     if path.exists():
         return FrameRingWriter.adopt(path)
-    return make_ring(path, source.camera, credit=credit)
+    return make_ring(path, source.camera, credit=credit, frames_before=frames_before)
 
 
 def timed(source: Source, index: int) -> tuple[Frame, float]:

@@ -116,7 +116,8 @@ def _sensor(parts: _Parts) -> "Steps":
     source = open_source(parts.source)
     if pace.is_realtime:
         return ReplaySensor(bus, link, source, ring_path, rate_hz=pace.replay_hz)
-    return RecordingSensor(bus, link, source, ring_path, credit=pace.credit)
+    durable = parts.run.catalog.num_frames  # when the sensor starts for the first time, these are all
+    return RecordingSensor(bus, link, source, ring_path, credit=pace.credit, frames_before=durable)
 
 
 def _tracker(parts: _Parts) -> "Steps":

@@ -17,6 +17,7 @@ from vtslam.services.frame_journal import JournalReader
 from vtslam.services.network import Door
 from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import peak_rss_mb
+from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
@@ -26,6 +27,7 @@ from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
 from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.section_convert import SectionArchive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +54,7 @@ def run_in_fleet(
     settings: Settings,
     hooks: FleetHooks,
     *,
+    resume: ResumePoint | None = None,
     fleet: str = "",
     base: Path = SHARED_MEMORY,
     door: Door | None = None,
@@ -59,9 +62,11 @@ def run_in_fleet(
     """Run the source that ``run.toml`` names, each service a process of its own.
 
     Args:
-        run: An empty run folder, open for writing; settings and source are read from its ``run.toml``.
+        run: A run folder, open for writing, empty unless ``resume`` is given; settings and source are read from its
+            ``run.toml``.
         settings: The same settings.
         hooks: What the caller is told and asked.
+        resume: Where to go on; from the beginning if None.
         fleet: Name of the fleet; one of its own unless given.
         base: Where the fleet's shared memory lies.
         door: How it is opened to other hosts; closed unless given.
@@ -86,6 +91,13 @@ def run_in_fleet(
             metrics.observe(facts)
             hooks.on_frame(facts)
 
+        def on_event(text: str) -> None:
+            run.catalog.add_event("restarted", text)
+            hooks.on_event(text)
+
+        if resume is not None:
+            section = SectionArchive(run).read(resume.section_id)
+            store.restore(section, resume.frame, resume.facts.packed())
         recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
         access = None if door is None else door.access_of(folder.path)
         with Hub(folder.path, fleet, access) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
@@ -96,7 +108,7 @@ def run_in_fleet(
                 recorder=recorder,
                 hang_s=settings.fleet.hang_s,
                 pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,
-                on_event=hooks.on_event,
+                on_event=on_event,
                 environment=hooks.environment,
             )
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):

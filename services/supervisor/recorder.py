@@ -1,9 +1,9 @@
-"""Writes the run folder of a fleet from its shared memory: sections, trajectory, facts per frame."""
+"""Writes the run folder of a fleet from its shared memory: sections with their frames."""
 
 import contextlib
 from collections.abc import Callable
 
-from vtslam.common.shm.errors import SectionNotResident, SectionPinned, SharedMemoryError
+from vtslam.common.shm.errors import SectionPinned, SharedMemoryError
 from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame, FrameFacts
@@ -30,8 +30,9 @@ class Recorder:
     ) -> None:
         self._run, self._store, self._journal, self._on_frame = run, store, journal, on_frame
         self._record = RunRecord(run)
-        self._on_disk: set[int] = set()
-        self._frames_on_disk = self._frames_written = 0
+        self._next_section = len(run.catalog.sections())
+        journal.forget_before(self._next_section)
+        self._ended: dict[int, CommitFacts] = {}  # by section: sealed, and all its frames are known
 
     @property
     def num_frames(self) -> int:
@@ -46,9 +47,6 @@ class Recorder:
         """
         self._take_frames()
         self._archive(resident=1 if make_room else _RESIDENT_SECTIONS)
-        if self._frames_written < self._frames_on_disk <= self.num_frames:
-            self._record.write()
-            self._frames_written = self.num_frames
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
         """Write everything that is not written yet; see `RunRecord.finish`."""
@@ -61,35 +59,42 @@ class Recorder:
         with contextlib.suppress(SharedMemoryError):  # which may be why the fleet cannot go on
             last = self._store.last_commit()  # whoever committed it may have died before it wrote to the journal
             if last is not None:
-                self._take(CommitFacts.unpacked(last.facts).frame)
-        self._record.finish(finished=False, interrupted=False, seconds=seconds, peak_rss_mb=peak_rss_mb)
+                facts = CommitFacts.unpacked(last.facts)
+                self._take(facts.frame)
+                if last.is_sealed and last.section_id >= self._next_section:
+                    self._ended[last.section_id] = facts
+                    self._archive(resident=_RESIDENT_SECTIONS)
+        self._record.finish_broken(seconds=seconds, peak_rss_mb=peak_rss_mb)
 
     def _take_frames(self) -> None:
-        for frame in self._journal.new_frames():
-            self._take(frame)
+        for line in self._journal.new_lines():
+            if line.ended is not None:
+                self._ended[line.frame.facts.section_id] = line.ended
+            self._take(line.frame)
 
     def _take(self, frame: CommittedFrame) -> None:
-        last = self._record.last()
-        is_new = last is None or frame.facts.frame_id > last.facts.frame_id
+        is_new = frame.facts.frame_id > self._record.last_frame_id
         self._record.add(frame)
         if is_new:
             self._on_frame(frame.facts)
 
     def _archive(self, *, resident: int) -> None:
+        while self._next_section in self._ended:
+            self._write(self._next_section)
+            self._next_section += 1
+            self._journal.forget_before(self._next_section)
         sealed = self._store.sealed_ids()
-        for section_id in sealed:
-            if section_id not in self._on_disk:
-                self._write(section_id)
         for section_id in sealed[: max(len(sealed) - resident, 0)]:
-            with contextlib.suppress(SectionPinned):
-                self._store.unlink_sealed(section_id, verified_on_disk=True)
+            if section_id < self._next_section:
+                with contextlib.suppress(SectionPinned):
+                    self._store.unlink_sealed(section_id, verified_on_disk=True)
 
     def _write(self, section_id: int) -> None:
-        with contextlib.suppress(SectionNotResident):
-            held = self._store.pinned_sealed(section_id)
-            try:
-                self._run.write_section(record_of(held.section))
-                self._frames_on_disk += len(held.section.frames)
-            finally:
-                held.release()
-            self._on_disk.add(section_id)
+        """Make a section durable; the map store keeps it until then."""
+        held = self._store.pinned_sealed(section_id)
+        try:
+            record = record_of(held.section)
+            self._run.write_section(record)
+            self._record.commit(record, self._ended.pop(section_id))
+        finally:
+            held.release()

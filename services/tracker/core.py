@@ -13,7 +13,8 @@ from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.optim.alignment import PosePrior
-from vtslam.common.overlap.selection import CandidateView, overlap_shares, sections_to_pretrack, world_points_m
+from vtslam.common.overlap.search import OverlapSearch
+from vtslam.common.overlap.view_index import ViewIndex
 from vtslam.common.section import Section
 from vtslam.common.settings import TrackerSettings
 from vtslam.common.splat.engine import Engine
@@ -33,7 +34,7 @@ class MapReader(Protocol):
         """A section, loaded if it is not in memory."""
         ...
 
-    def candidate_views(self) -> list[CandidateView]:
+    def candidate_views(self) -> ViewIndex:
         """All candidate views, in order of time."""
         ...
 
@@ -109,14 +110,10 @@ class Tracker:
             if own.gaussians.count or section_id == 0:
                 return [own]
             return [map_reader.section(section_id - 1)]
-        views = [
-            view
-            for view in map_reader.candidate_views()
-            if not (self.settings.overlap.skip_previous and view.section_id == section_id - 1 and not view.is_head)
-        ]
-        points = world_points_m(frame, T_guess, frame.depth > 0)
-        shares = overlap_shares(points, views, self.settings.overlap)
-        ids = sections_to_pretrack(shares, views, head_section_id=section_id, settings=self.settings.overlap)
+        overlap = self.settings.overlap
+        only_head_of = section_id - 1 if overlap.skip_previous else None
+        search = OverlapSearch(map_reader.candidate_views(), frame, T_guess, overlap, only_head_of=only_head_of)
+        ids = search.sections_to_pretrack(head_section_id=section_id)
         if not ids:
             return []
         # The surfaces of all of them and of the previous section count beside S^o's own: the head then agrees with

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
-from vtslam.common.messages import Odometry, TrackedPose, TrackerHistory
+from vtslam.common.messages import Odometry, TrackedPose
 from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.topics import TRACKER_ODOMETRY, TRACKER_POSE
 from vtslam.common.tracking_facts import TrackingQuality, TrackingState
@@ -74,7 +74,7 @@ class PosePublisher:
                 quality=None if result is None else _quality(result),
                 state=TrackingState.OK if result is None else result.state,
                 overlap_section_id=-1 if result is None else result.overlap_section_id,
-                history=_history(after),
+                history=after.history(),
                 num_tracked=num_tracked,
                 read_s=read_s,
                 track_s=track_s,
@@ -115,22 +115,7 @@ def committed_state(facts: CommitFacts | None, frame: Frame | None) -> TrackerSt
     """What the tracker remembers after a commit: its ``facts``, and the frame; nothing before the first."""
     if facts is None:
         return TrackerState()
-    history = facts.history
-    return TrackerState(
-        committed_poses=facts.committed_poses,
-        previous_frame=frame,
-        losses=tuple(zip(history.color_losses, history.depth_losses_m, strict=True)),
-        largest_mean_depths_m=history.largest_mean_depths_m,
-        exposure=facts.exposure,
-    )
-
-
-def _history(state: TrackerState) -> TrackerHistory:
-    return TrackerHistory(
-        color_losses=tuple(float(color) for color, _ in state.losses),
-        depth_losses_m=tuple(float(depth) for _, depth in state.losses),
-        largest_mean_depths_m=tuple(float(depth) for depth in state.largest_mean_depths_m),
-    )
+    return TrackerState.resumed(facts.committed_poses, frame, facts.history, facts.exposure)
 
 
 def _quality(result: TrackResult) -> TrackingQuality:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
-from vtslam.common.messages.mapping import MAX_LOSSES, MAX_MEAN_DEPTHS
+from vtslam.common.messages.mapping import MAX_LOSSES, MAX_MEAN_DEPTHS, TrackerHistory
 from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 
 _HISTORY_FRAMES = MAX_LOSSES  # losses remembered: enough for a stable median, bounded on endless streams
@@ -52,6 +52,31 @@ class TrackerState:
     losses: tuple[tuple[float, float], ...] = ()
     largest_mean_depths_m: tuple[float, ...] = ()
     exposure: Exposure = field(default_factory=Exposure.identity)
+
+    @classmethod
+    def resumed(
+        cls,
+        committed_poses: tuple[npt.NDArray[np.float64], ...],
+        previous_frame: Frame | None,
+        history: TrackerHistory,
+        exposure: Exposure,
+    ) -> "TrackerState":
+        """The state of a :meth:`history` and the last commit."""
+        return cls(
+            committed_poses=committed_poses,
+            previous_frame=previous_frame,
+            losses=tuple(zip(history.color_losses, history.depth_losses_m, strict=True)),
+            largest_mean_depths_m=history.largest_mean_depths_m,
+            exposure=exposure,
+        )
+
+    def history(self) -> TrackerHistory:
+        """What is not in the last commit, as messages and files keep it."""
+        return TrackerHistory(
+            color_losses=tuple(float(color) for color, _ in self.losses),
+            depth_losses_m=tuple(float(depth) for _, depth in self.losses),
+            largest_mean_depths_m=tuple(float(depth) for depth in self.largest_mean_depths_m),
+        )
 
     def constant_velocity_guess(self) -> npt.NDArray[np.float64]:
         """T_t = T_{t-1} T_{t-2}^-1 T_{t-1}; the last pose if there is only one, the identity if there is none."""

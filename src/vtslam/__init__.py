@@ -19,16 +19,17 @@ Run a recording, look at what it left, judge it::
 
 Or feed frames of your own, one by one, and take the poses as they come::
 
-    >>> class Sections(dict):  # where finished sections go; a run folder has SectionArchive
-    ...     def write(self, section): self[section.section_id] = section
-    ...     def read(self, section_id): return self[section_id]
+    >>> class Sections(vtslam.Archive):  # where finished sections go; a run folder has SectionArchive
+    ...     def __init__(self): self.kept = {}
+    ...     def write(self, section): self.kept[section.section_id] = section
+    ...     def read(self, section_id): return self.kept[section_id]
     >>> settings = vtslam.load_settings(preset="fast", assignments=["section.length=2"])
     >>> sections = Sections()
     >>> system = vtslam.System(settings, vtslam.make_engine(settings.splat), sections, threads=1)
     >>> source = vtslam.open_source("sim:room?frames=60", size=(96, 72))
     >>> for index in range(3):
     ...     report = system.process(source.frame(index))
-    >>> report.tracking.state.name, report.commit.T_world_camera.shape, sorted(sections)
+    >>> report.tracking.state.name, report.commit.T_world_camera.shape, sorted(sections.kept)
     ('OK', (4, 4), [0])
 
 Names are imported when they are first used, so that ``import vtslam`` costs nothing.

@@ -29,6 +29,7 @@ from vtslam.services.frame_journal import JournalReader
 from vtslam.services.map_follower import MapFollower, StoreArchive
 from vtslam.services.mapper.service import FleetPaths, MapperService
 from vtslam.services.pacing import Pace
+from vtslam.services.section_map import ReadsSections
 from vtslam.services.sensor.service import RecordingSensor
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.system import System
@@ -94,12 +95,15 @@ class Result:
     poses: tuple[bytes, ...]
 
 
-class Sections(dict[int, Section]):
+class Sections(ReadsSections):
+    def __init__(self) -> None:
+        self.written: dict[int, Section] = {}
+
     def write(self, section: Section) -> None:
-        self[section.section_id] = section
+        self.written[section.section_id] = section
 
     def read(self, section_id: int) -> Section:
-        return self[section_id]
+        return self.written[section_id]
 
 
 @lru_cache(maxsize=1)
@@ -110,7 +114,7 @@ def expected() -> Result:
     reports = [system.process(source.frame(index)) for index in range(FRAMES)]
     system.finish()
     return Result(
-        tuple(section_bytes(section) for section in sections.values()),
+        tuple(section_bytes(section) for section in sections.written.values()),
         tuple(report.commit.T_world_camera.tobytes() for report in reports),
     )
 
@@ -203,7 +207,7 @@ class FleetWorld:
         """Let the fleet run to its end."""
         assert self.world.run(timeout_s=TIMEOUT_S), f"no end; deaths {self.world.deaths}"
         sections = [self._store.pinned_sealed(section_id).section.retied() for section_id in self._store.sealed_ids()]
-        frames = {each.facts.frame_id: each for each in JournalReader(self._folder / "journal").new_frames()}
+        frames = {line.frame.facts.frame_id: line.frame for line in JournalReader(self._folder / "journal").new_lines()}
         assert sorted(frames) == list(range(len(self._source)))
         return Result(
             tuple(section_bytes(section) for section in sections),

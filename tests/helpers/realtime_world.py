@@ -145,12 +145,12 @@ class RealtimeWorld:
         captured = [pose.frame_id / RATE_HZ for _, pose in poses]
         start_s = poses[0][0] * 1e-9 - captured[0]  # the first pose comes at once
         sealed = [self._store.pinned_sealed(i).section for i in self._store.sealed_ids()]
-        lines = JournalReader(self._folder / "journal").new_frames()
+        lines = JournalReader(self._folder / "journal").new_lines()
         return RealtimeResult(
             published=said["sensor"].counters["frames.published"],
             tracked=said["tracker"].counters["frames.tracked"],
             dropped=said["tracker"].counters["frames.dropped"],
-            mapped=sorted({line.facts.frame_id for line in lines}),
+            mapped=sorted({line.frame.facts.frame_id for line in lines}),
             sections=[[frame.frame_id for frame in section.frames] for section in sealed],
             ages_s=[
                 float(now_ns * 1e-9 - start_s - before)

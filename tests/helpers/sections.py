@@ -1,8 +1,12 @@
 """Small section records for tests; that of `small_section` is the same on every machine, to the bit."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from vtslam.common.geometry.camera import Camera
+from vtslam.storage.catalog_rows import FrameRow
 from vtslam.storage.section_record import SectionRecord
 
 WIDTH, HEIGHT, NUM_FRAMES = 6, 4, 3
@@ -84,6 +88,19 @@ def surface_section(*, frames: int = 4, width: int = 24, height: int = 16, seed:
         view_index=np.array([0, 2], np.uint16),
         view_depth=view,
     )
+
+
+def frames_of(record: SectionRecord, facts: Sequence[Mapping[str, Any]] = ()) -> list[FrameRow]:
+    """The rows of its frames, at the poses of the record."""
+    return [
+        FrameRow(
+            frame_id=int(frame_id),
+            capture_time_ns=int(record.capture_times_ns[row]),
+            T_world_camera=record.T_world_section @ record.T_section_frame[row],
+            facts=facts[row] if facts else {"frame_id": int(frame_id), "state": "ok"},
+        )
+        for row, frame_id in enumerate(record.frame_ids)
+    ]
 
 
 def assert_same_section(found: SectionRecord, expected: SectionRecord) -> None:

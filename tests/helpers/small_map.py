@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from helpers.view_index import index_of
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.overlap.selection import CandidateView
+from vtslam.common.overlap.view_index import ViewIndex
 from vtslam.common.section import Section
 from vtslam.common.settings import MapperSettings, SectionSettings
 from vtslam.common.splat.native_engine import NativeEngine
@@ -115,8 +117,8 @@ class FixedMap:
     def section(self, section_id: int) -> Section:
         return self.sections[section_id]
 
-    def candidate_views(self) -> list[CandidateView]:
-        return self.views
+    def candidate_views(self) -> ViewIndex:
+        return index_of(self.views)
 
 
 def section_bytes(section: Section) -> bytes:

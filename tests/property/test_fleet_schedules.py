@@ -5,7 +5,7 @@ from helpers.fleet_world import FRAMES, expected, run_world
 
 from vtslam.common.bus_schedule import KillAt, ScriptedSchedule, SeededKills, SeededSchedule
 from vtslam.common.shm.errors import SharedMemoryFull
-from vtslam.services.frame_facts import CommittedFrame
+from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_journal import JournalWriter
 
 _SERVICES = ("sensor", "tracker", "mapper")
@@ -21,12 +21,12 @@ def test_undisturbed() -> None:
 def test_a_journal_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     real, refused = JournalWriter.append, []
 
-    def append(journal: JournalWriter, frame: CommittedFrame) -> None:
-        frame_id = frame.facts.frame_id
+    def append(journal: JournalWriter, facts: CommitFacts, *, section_ended: bool) -> None:
+        frame_id = facts.frame.facts.frame_id
         if frame_id > 1 and frame_id not in refused:  # some section is sealed, so that room may come
             refused.append(frame_id)
             raise SharedMemoryFull("journal", wanted_bytes=700, free_bytes=0)
-        real(journal, frame)
+        real(journal, facts, section_ended=section_ended)
 
     monkeypatch.setattr(JournalWriter, "append", append)
     result, _ = run_world(ScriptedSchedule())

@@ -48,6 +48,15 @@ def test_splat_reports_times_and_where_they_were_taken(tmp_path: Path, capsys: p
     assert "forward_backward_ms" in table
 
 
+def test_choosing_overlapping_sections_looks_at_few_views_of_many(tmp_path: Path) -> None:
+    words = ["--views", "3000", "--size", "80x24"]
+    values = bench("overlap", *words, result=tmp_path / "overlap.json")
+    assert (values["views"], values["width"], values["height"]) == (3000, 80, 24)
+    assert min(values[key] for key in ("select_ms", "select_ms_tenth", "neighbour_ms", "growth")) > 0
+    assert 1 <= values["views_looked_at"] < 40
+    assert values["bytes_per_view"] < 1000
+
+
 def test_track_stands_beside_opencv_on_the_same_frames(tmp_path: Path) -> None:
     values = bench("track", *SMALL, result=tmp_path / "track.json")
     assert values["ate_rmse_m"] < 0.02

@@ -1,49 +1,111 @@
+"""The journal of committed frames: whole lines, in order, section by section."""
+
 import errno
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from vtslam.common.messages import TrackerHistory
 from vtslam.common.shm.errors import SharedMemoryFull
+from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame, FrameFacts
 from vtslam.services.frame_journal import JournalReader, JournalWriter
 
+LENGTH = 3
 
-def committed(frame_id: int) -> CommittedFrame:
-    facts = FrameFacts(
+
+def facts_of(frame_id: int) -> CommitFacts:
+    about = FrameFacts(
         frame_id=frame_id,
-        section_id=0,
-        is_head=False,
+        section_id=frame_id // LENGTH,
+        is_head=frame_id % LENGTH == 0,
         held_out=False,
         state="ok",
         tracked_section_id=0,
         rescued=False,
-        covered_share=1.0,
+        covered_share=0.5,
         color_loss=0.1,
-        depth_loss_m=0.1,
-        position_sigma_m=0.0,
-        rotation_sigma_rad=0.0,
+        depth_loss_m=0.02,
+        position_sigma_m=0.001,
+        rotation_sigma_rad=0.002,
         exposure_gain=(1.0, 1.0, 1.0),
         exposure_offset=(0.0, 0.0, 0.0),
-        map_loss=0.1,
-        gaussians_added=1,
-        gaussians=1,
-        track_renders=1,
-        map_renders=1,
+        map_loss=0.3,
+        gaussians_added=4,
+        gaussians=40,
+        track_renders=5,
+        map_renders=6,
         read_s=0.0,
         track_s=0.0,
         map_s=0.0,
         total_s=0.0,
     )
-    return CommittedFrame(facts=facts, capture_time_ns=frame_id, T_world_camera=np.eye(4))
+    T = np.eye(4)
+    T[0, 3] = 0.1 * frame_id
+    return CommitFacts(
+        num_frames=frame_id + 1,
+        num_tracked=frame_id + 1,
+        sequence=frame_id + 1,
+        iterations=3,
+        frame=CommittedFrame(facts=about, capture_time_ns=frame_id, T_world_camera=T),
+        T_world_previous=None,
+        history=TrackerHistory(color_losses=(0.1,), depth_losses_m=(0.2,), largest_mean_depths_m=(2.5,)),
+        pixels_crc32=7,
+    )
+
+
+def append(writer: JournalWriter, *frame_ids: int) -> None:
+    for frame_id in frame_ids:
+        writer.append(facts_of(frame_id), section_ended=frame_id % LENGTH == LENGTH - 1)
+
+
+def new_ids(reader: JournalReader) -> list[int]:
+    return [line.frame.facts.frame_id for line in reader.new_lines()]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "journal"
+
+
+def test_lines_are_read_once_and_in_order_over_many_sections(folder: Path) -> None:
+    reader = JournalReader(folder)
+    assert new_ids(reader) == []
+    writer = JournalWriter(folder)
+    append(writer, 0, 1)
+    assert new_ids(reader) == [0, 1]
+    append(writer, 2, 3, 4, 5, 6, 7)
+    lines = reader.new_lines()
+    assert [line.frame.facts.frame_id for line in lines] == [2, 3, 4, 5, 6, 7]
+    assert [line.ended is not None for line in lines] == [True, False, False, True, False, False]
+    ended = lines[3].ended
+    assert ended is not None
+    assert ended.packed() == facts_of(5).packed()
+    assert new_ids(reader) == []
+    writer.close()
+
+
+def test_a_line_that_was_cut_is_written_anew(folder: Path) -> None:
+    writer, reader = JournalWriter(folder), JournalReader(folder)
+    append(writer, 0, 1)
+    writer.close()
+    path = folder / "000000"
+    path.write_bytes(path.read_bytes()[:-5])
+    assert new_ids(reader) == [0]
+    writer = JournalWriter(folder)
+    append(writer, 1, 2)
+    assert new_ids(reader) == [1, 2]
+    writer.close()
 
 
 def test_a_line_that_does_not_fit_leaves_nothing_and_can_be_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer, reader = JournalWriter(tmp_path / "journal"), JournalReader(tmp_path / "journal")
-    writer.append(committed(0))
+    writer, reader = JournalWriter(folder), JournalReader(folder)
+    append(writer, 0)
     real, calls = os.write, []
 
     def full_after_some_bytes(fd: int, data: bytes) -> int:
@@ -54,10 +116,31 @@ def test_a_line_that_does_not_fit_leaves_nothing_and_can_be_tried_again(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full_after_some_bytes)
-        with pytest.raises(SharedMemoryFull, match=r"journal: \d+ bytes of shared memory wanted"):
-            writer.append(committed(1))
-    writer.append(committed(2))
+        with pytest.raises(SharedMemoryFull, match=r"journal/000000: \d+ bytes of shared memory wanted"):
+            append(writer, 1)
+    append(writer, 2)
     writer.close()
 
     assert len(calls) == 2
-    assert [frame.facts.frame_id for frame in reader.new_frames()] == [0, 2]
+    assert new_ids(reader) == [0, 2]
+
+
+def test_durable_sections_are_forgotten_also_if_they_are_announced_again(folder: Path) -> None:
+    writer, reader = JournalWriter(folder), JournalReader(folder)
+    append(writer, *range(7))
+    assert len(new_ids(reader)) == 7
+    reader.forget_before(2)
+    assert [path.name for path in folder.iterdir()] == ["000002"]
+    writer.close()
+    again = JournalWriter(folder)
+    append(again, 5, 7, 8)
+    assert new_ids(reader) == [7, 8]
+    again.close()
+
+
+def test_facts_survive_exactly() -> None:
+    facts = replace(facts_of(1), T_world_previous=np.full((4, 4), 1 / 3))
+    again = CommitFacts.unpacked(facts.packed())
+    assert again.packed() == facts.packed()
+    assert again.T_world_previous is not None
+    assert again.T_world_previous.tobytes() == np.full((4, 4), 1 / 3).tobytes()

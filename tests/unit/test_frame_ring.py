@@ -186,3 +186,15 @@ def test_atomic_words() -> None:
         words.load(4)
     with pytest.raises(ValueError, match="aligned"):
         Words(np.zeros(33, np.uint8)[1:].view(np.uint64))
+
+
+def test_a_ring_may_begin_after_frames_that_are_done_with(path: Path) -> None:
+    FrameRingWriter.create(path, _SPEC, acknowledged=7)
+    reader = FrameRingReader(path)
+    assert (reader.published, reader.acknowledged, reader.unacknowledged()) == (7, 7, [])
+    reader.acknowledge(7)
+    writer = FrameRingWriter.adopt(path)
+    assert [writer.try_publish(frame_of(i), credit=2) is None for i in range(3)] == [False, False, True]
+    assert [each.sequence for each in reader.unacknowledged()] == [8, 9]
+    assert frame_bytes(reader.copied(reader.unacknowledged()[0])) == frame_bytes(frame_of(0))
+    assert reader.lost == 0

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.shm_sections import SmallSection, sealed_section, section_bytes, spec_of
+from helpers.shm_sections import SmallSection, frame_bytes, frame_of, sealed_section, section_bytes, spec_of
 
 from vtslam.common.shm.errors import (
     DamagedBlock,
@@ -188,3 +188,15 @@ def test_impossible_sections_are_refused(change: dict[str, int]) -> None:
         replace(spec_of(1), **change)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="1 to 4 kept generations"):
         replace(spec_of(1), kept_generations=5)
+
+
+def test_a_store_begins_with_a_section_from_disk(store: MapStore) -> None:
+    section = sealed_section(SmallSection(section_id=4), 2)
+    store.restore(section, frame_of(9), b"facts")
+    last = store.last_commit()
+    assert last is not None
+    assert (last.section_id, last.frame_index, last.facts, last.is_sealed) == (4, 1, b"facts", True)
+    assert frame_bytes(last.frame) == frame_bytes(frame_of(9))
+    assert section_bytes(store.pinned_sealed(4, verify=True).section) == section_bytes(section)
+    assert (store.active_id(), store.adopt_active()) == (None, None)
+    assert store.create_active(spec_of(5)).section_id == 5

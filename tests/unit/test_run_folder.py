@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sections import assert_same_section, small_section
+from helpers.sections import assert_same_section, frames_of, small_section
 
 from vtslam.storage import run_folder
 from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked, UnreadableFile, WriteFailed
@@ -46,7 +46,7 @@ def test_new_folder(path: Path) -> None:
     with RunFolder.create(path, INFO) as run:
         assert run.read_info() == INFO
     assert RunFolder.open(path).read_info() == INFO
-    assert sorted(entry.name for entry in path.iterdir()) == ["lock", "run.toml", "sections"]
+    assert sorted(entry.name for entry in path.iterdir()) == ["catalog.sqlite", "lock", "run.toml", "sections"]
 
 
 def test_info_is_the_same_text_each_time(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_what_a_crash_while_making_leaves_is_used(path: Path) -> None:
     (path / "lock").write_text("1\n")
     (path / ".run.toml.0123abcd.tmp").write_text("half")
     RunFolder.create(path, INFO).close()
-    assert sorted(entry.name for entry in path.iterdir()) == ["lock", "run.toml", "sections"]
+    assert sorted(entry.name for entry in path.iterdir()) == ["catalog.sqlite", "lock", "run.toml", "sections"]
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -86,16 +86,17 @@ def test_file_in_the_way(path: Path) -> None:
     path.write_text("precious")
     with pytest.raises(RunFolderError, match="expected a folder or nothing, found a file"):
         RunFolder.create(path, INFO, overwrite=True)
-    with pytest.raises(WriteFailed, match="cannot make a run folder: Not a directory"):
+    with pytest.raises(WriteFailed, match="cannot write: Not a directory"):
         RunFolder.create(path / "deeper", INFO)
     assert path.read_text() == "precious"
 
 
 def test_run_is_overwritten_only_when_asked(path: Path) -> None:
     with RunFolder.create(path, INFO) as run:
-        run.write_section(small_section())
-        run.write_frames([{"frame_id": 30}])
-        run.trajectory_path.write_text("0 0 0 0 0 0 0 1\n")
+        record = small_section()
+        run.write_section(record)
+        run.commit_section(record, frames_of(record))
+        assert len(run.trajectory_path.read_text().splitlines()) == 3
     (path / "metrics.json").write_text("{}")
     (path / "notes.txt").write_text("mine")
     with pytest.raises(RunFolderError, match="there is already a run here; choose another folder or ask to overwrite"):
@@ -107,7 +108,13 @@ def test_run_is_overwritten_only_when_asked(path: Path) -> None:
     run = RunFolder.open(path)
     assert run.read_info() == other
     assert run.section_ids() == []
-    assert sorted(entry.name for entry in path.iterdir()) == ["lock", "notes.txt", "run.toml", "sections"]
+    assert sorted(entry.name for entry in path.iterdir()) == [
+        "catalog.sqlite",
+        "lock",
+        "notes.txt",
+        "run.toml",
+        "sections",
+    ]
 
 
 def test_opening_what_is_no_run(path: Path) -> None:
@@ -180,7 +187,9 @@ def test_reader_cannot_write(path: Path) -> None:
     with pytest.raises(RunFolderError, match="open for reading only"):
         run.write_section(small_section())
     with pytest.raises(RunFolderError, match="open for reading only"):
-        run.write_frames([])
+        run.commit_section(small_section(), frames_of(small_section()))
+    with pytest.raises(RunFolderError, match="open for reading only"):
+        run.drop_sections(0)
     with pytest.raises(RunFolderError, match="open for reading only"):
         run.write_info(INFO)
 
@@ -223,41 +232,21 @@ def test_finished_mark(path: Path) -> None:
     assert RunFolder.open(path).read_info() == finished
 
 
-def test_frames(path: Path) -> None:
+def test_facts_of_frames(path: Path) -> None:
+    record = small_section(section_id=0)
+    facts: list[dict[str, Any]] = [
+        {"frame_id": np.int64(30), "loss": np.float32(0.5)},
+        {"frame_id": 31, "x": [float("nan"), {"y": np.inf}]},
+        {"frame_id": 33},
+    ]
     with RunFolder.create(path, INFO) as run:
-        run.write_frames([{"frame_id": 9}])
-        rows: list[dict[str, Any]] = [
-            {"frame_id": np.int64(0), "loss": np.float32(0.5)},
-            {"frame_id": 1, "x": [float("nan"), {"y": np.inf}]},
-        ]
-        run.write_frames(rows)
-        assert run.read_frames() == [{"frame_id": 0, "loss": 0.5}, {"frame_id": 1, "x": [None, {"y": None}]}]
-        with pytest.raises(RunFolderError, match=r"frames\.jsonl: row 2 cannot be written: .*bytes"):
-            run.write_frames([{}, {"a": b"x"}])
-        assert len(run.read_frames()) == 2
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (b'{"a": 1}\n{"a": \n', r"frames\.jsonl:2: expected a JSON object"),
-        (b"[1]\n", r"frames\.jsonl:1: expected a JSON object, found b'\[1\]'"),
-        (b'{"a": NaN}\n', r"frames\.jsonl:1: .*NaN is not JSON"),
-        (b'{"a": "\xff"}\n', r"frames\.jsonl:1: expected a JSON object"),
-        (b"[" * 100_000, r"frames\.jsonl:1: expected a JSON object"),
-    ],
-)
-def test_damaged_frames(path: Path, text: bytes, message: str) -> None:
-    RunFolder.create(path, INFO).close()
-    (path / "frames.jsonl").write_bytes(text)
-    with pytest.raises(RunFolderError, match=message):
-        RunFolder.open(path).read_frames()
-
-
-def test_missing_frames(path: Path) -> None:
-    RunFolder.create(path, INFO).close()
-    with pytest.raises(RunFolderError, match=r"frames\.jsonl: cannot read: No such file"):
-        RunFolder.open(path).read_frames()
+        run.write_section(record)
+        with pytest.raises(RunFolderError, match=r"facts of section 0 have no JSON form: .*bytes"):
+            run.commit_section(record, frames_of(record, [{}, {"a": b"x"}, {}]))
+        assert run.read_frames() == []
+        run.commit_section(record, frames_of(record, facts))
+        expected = [{"frame_id": 30, "loss": 0.5}, {"frame_id": 31, "x": [None, {"y": None}]}, {"frame_id": 33}]
+        assert run.read_frames() == expected
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.native_engine import NativeEngine
 from vtslam.common.tracking_facts import TrackingState
+from vtslam.services.section_map import ReadsSections
 from vtslam.services.system import FrameReport, Seal, System
 from vtslam.storage.section_convert import record_of, section_of
 
@@ -33,7 +34,7 @@ SMALL = (
 
 
 @dataclass(slots=True)
-class MemoryArchive:
+class MemoryArchive(ReadsSections):
     """Sections as records, turned back on reading, as files would."""
 
     written: dict[int, Section] = field(default_factory=dict)

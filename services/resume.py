@@ -1,0 +1,80 @@
+"""Where a run that was cut off goes on: the end of its last durable section, with all that crosses a frame boundary."""
+
+from dataclasses import dataclass
+
+from vtslam.common.frame import Frame
+from vtslam.services.commit_facts import CommitFacts
+from vtslam.services.sensor.sources.base import Source
+from vtslam.storage.catalog_rows import STORED, SectionRow
+from vtslam.storage.errors import ChecksumMismatch, RunFolderError
+from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.section_facts import file_facts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResumePoint:
+    """The end of a durable section.
+
+    Attributes:
+        section_id: The section.
+        facts: What was committed by then.
+        frame: Its last frame, read again.
+    """
+
+    section_id: int
+    facts: CommitFacts
+    frame: Frame
+
+
+def prepare_to_resume(run: RunFolder, source: Source, *, section_length: int) -> ResumePoint | None:
+    """Bring a run folder to the end of its last durable full section.
+
+    A shorter last section, which a run leaves that was asked to stop, is dropped unless the recording ends with it:
+    it is mapped again, as long as it would have been. So is everything after a section that was set aside.
+
+    Args:
+        run: The run folder, open for writing.
+        source: Its recording.
+        section_length: Frames of a section.
+
+    Returns:
+        Where to go on; None for the beginning.
+
+    Raises:
+        StorageError: A section's file is not what the catalogue says, or nothing is known to go on from.
+        SourceError: The last frame cannot be read.
+    """
+    last: SectionRow | None = None
+    for row in run.catalog.sections():
+        is_short = row.num_frames < section_length and row.end_frame_id < len(source)
+        if row.state != STORED or is_short:
+            break
+        require_intact(run, row)
+        last = row
+    run.drop_sections(0 if last is None else last.section_id + 1)
+    run.remove_derived()
+    if last is None:
+        return None
+    packed = run.catalog.resume_record(last.section_id)
+    if packed is None:
+        raise RunFolderError(f"{run.path}: section {last.section_id} holds nothing to go on from; run it again")
+    facts = CommitFacts.unpacked(packed)
+    frame = source.frame(facts.num_frames - 1)
+    if frame.capture_time_ns != facts.frame.capture_time_ns or not facts.saw(frame):
+        raise RunFolderError(
+            f"{run.path}: frame {frame.frame_id} of {source.uri} is not the one that was mapped; the recording changed"
+        )
+    return ResumePoint(section_id=last.section_id, facts=facts, frame=frame)
+
+
+def require_intact(run: RunFolder, row: SectionRow) -> None:
+    """Raise StorageError unless a section's file is, by its size and footer, the one of the catalogue."""
+    path, advice = run.section_path(row.section_id), f"(vtslam sections repair {run.path} sets it aside)"
+    found = file_facts(path)
+    if (found.num_bytes, found.sha256) != (row.num_bytes, row.sha256):
+        raise ChecksumMismatch.differing(
+            path,
+            "file",
+            expected=f"{row.num_bytes} bytes with SHA-256 {row.sha256.hex()[:16]}...",
+            found=f"{found.num_bytes} with {found.sha256.hex()[:16]}... {advice}",
+        )
