@@ -164,6 +164,14 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     splat.add_argument("--repeats", type=int, default=15, metavar="N", help="measurements (default: %(default)s)")
     track = kinds.add_parser("track", help="tracking on a recording, beside OpenCV's RGB-D odometry")
     mapping = kinds.add_parser("map", help="mapping alone, at the recording's true poses")
+    curves = kinds.add_parser("curves", help="mapping at the true poses: quality by time, for two schedules")
+    curves.add_argument(
+        "--presets", default="fast,paper", metavar="A,B", help="schedules, two at most (default: %(default)s)"
+    )
+    curves.add_argument(
+        "--shares", default="0.25,0.5,1,2", metavar="X,Y", help="shares of their steps (default: %(default)s)"
+    )
+    curves.add_argument("--picture", type=Path, metavar="FILE", help="draw the curves, PNG or JPEG")
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
     basin = kinds.add_parser("basin", help="how far off a first guess of the pose may be, for both optimisers")
     basin.add_argument("--trials", type=int, default=30, metavar="N", help="guesses per error (default: %(default)s)")
@@ -195,12 +203,12 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     overlap = kinds.add_parser("overlap", help="choosing overlapping sections on a long road")
     overlap.add_argument("--views", type=int, default=100_000, metavar="N", help="along it (default: %(default)s)")
     overlap.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
-    for kind in (track, mapping, system, basin, fleet):
+    for kind in (track, mapping, curves, system, basin, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
-    for kind in (track, mapping, system, basin, codec, fleet, chaos):
+    for kind in (track, mapping, curves, system, basin, codec, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, overlap, track, mapping, system, basin, codec, fleet, chaos):
+    for kind in (splat, overlap, track, mapping, curves, system, basin, codec, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

@@ -12,6 +12,7 @@ from vtslam.services.bench.codec import bench_codec, steps
 from vtslam.services.bench.codec_picture import write_codec_picture
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
 from vtslam.services.bench.fleet import PARTS, FleetBench, bench_fleet
+from vtslam.services.bench.map_curves import MOST_SCHEDULES, bench_map_curves, write_map_picture
 from vtslam.services.bench.overlap import HEADS, bench_overlap
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
@@ -43,6 +44,7 @@ def _measured(args: Namespace) -> dict[str, object]:
         "splat": _splat,
         "basin": _basin,
         "codec": _codec,
+        "curves": _curves,
         "chaos": _chaos,
         "fleet": _fleet,
         "overlap": _overlap,
@@ -73,6 +75,25 @@ def _basin(args: Namespace) -> dict[str, object]:
     plan = _plan(args)
     with Progress(2 * len(ERRORS_M_DEG) * args.trials, what="tracking", unit="guess") as progress:
         return bench_basin(plan, trials=args.trials, on_step=progress.step)
+
+
+def _curves(args: Namespace) -> dict[str, object]:
+    presets = args.presets.split(",")
+    try:
+        shares = [float(text) for text in args.shares.split(",")]
+    except ValueError:
+        shares = []
+    if len(presets) > MOST_SCHEDULES or not shares or not all(0.0 < share <= 100.0 for share in shares):
+        raise ConfigError(
+            f"bench curves: expected --presets of at most {MOST_SCHEDULES} and --shares above 0 and at most 100, "
+            f"found {args.presets} and {args.shares}"
+        )
+    plans = {preset: _plan(args, preset=preset) for preset in presets}
+    with Progress(len(plans) * len(shares), what="mapping", unit="run") as progress:
+        found = bench_map_curves(plans, shares, on_step=progress.step)
+    if args.picture is not None:
+        write_map_picture(args.picture, found)
+    return found
 
 
 def _codec(args: Namespace) -> dict[str, object]:
@@ -113,9 +134,13 @@ def _recording(args: Namespace) -> dict[str, object]:
     return _OF_RECORDINGS[args.bench](_plan(args))
 
 
-def _plan(args: Namespace) -> RunPlan:
+def _plan(args: Namespace, *, preset: str | None = None) -> RunPlan:
     return plan_run(
-        args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
+        args.source,
+        preset=preset or args.preset,
+        family=args.family,
+        config=args.config,
+        assignments=assignments_of(args),
     )
 
 

@@ -57,6 +57,19 @@ def test_choosing_overlapping_sections_looks_at_few_views_of_many(tmp_path: Path
     assert values["bytes_per_view"] < 1000
 
 
+def test_curves_show_what_more_steps_are_worth(tmp_path: Path) -> None:
+    words = ["sim:room?frames=4", "--size", "48x36", "--set", "section.length=2", "--shares", "0.2,1"]
+    picture = tmp_path / "curves.png"
+    values = bench("curves", *words, "--picture", str(picture), result=tmp_path / "curves.json")
+    for preset in ("fast", "paper"):
+        few, many = values[preset]["0.2"], values[preset]["1"]
+        assert few["renders_per_frame"]["map"] < many["renders_per_frame"]["map"]
+        assert few["psnr_paper_db"] < many["psnr_paper_db"]
+    assert picture.stat().st_size > 1000
+    assert main(["bench", "curves", *words, "--presets", "fast,paper,released"]) == 2
+    assert main(["bench", "curves", *words[:-1], "1,x"]) == 2
+
+
 def test_track_stands_beside_opencv_on_the_same_frames(tmp_path: Path) -> None:
     values = bench("track", *SMALL, result=tmp_path / "track.json")
     assert values["ate_rmse_m"] < 0.02
