@@ -81,10 +81,10 @@ class SimCity:
         if trajectory:
             file = FilePath(os.path.abspath(os.path.expanduser(trajectory)))
             self._path, drive = recorded_path(file), {"trajectory": str(file)}
-            self._streets = path_streets(self._path)
+            self._streets, self._driven = path_streets(self._path), self._path.places_m
         else:
             self._path, drive = lap_path(lap_m=block, laps=laps), {"laps": str(laps), "block": str(block)}
-            self._streets = block_streets(lap_m=block)
+            self._streets, self._driven = block_streets(lap_m=block), lap_path(lap_m=block, laps=1).places_m
         options = {"traffic": traffic, "seed": seed, "noise": noise, "size": f"{size[0]}x{size[1]}"}
         self.uri = str(
             SourceUri(scheme="sim", path="city", options={**drive, **{k: str(v) for k, v in options.items()}})
@@ -161,7 +161,7 @@ class SimCity:
         """The town, built when its first frame is asked for."""
         if self._town is None:
             skins = _textures(self._seed)
-            bodies = town_bodies(self._streets, self._path.places_m, seed=self._seed)
+            bodies = town_bodies(self._streets, self._driven, seed=self._seed)
             self._town, self._texture_names = make_town(bodies, segments(self._streets), skins), list(skins)
         return self._town
 

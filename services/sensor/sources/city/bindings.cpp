@@ -55,7 +55,8 @@ city::Body body(int kind, const double* p, const int* skin, const double* look, 
           {skin[2], look[4], look[5]},
           look[6],
           tint,
-          look[10]};
+          look[10],
+          kind == 0 ? std::hypot(p[4], p[5]) : p[4]};
 }
 
 std::vector<city::Body> bodies(const Kinds& kind, const Places& place, const Skins& skin, const Looks& look,

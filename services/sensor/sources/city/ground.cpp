@@ -14,7 +14,7 @@ using raycast::Rgb;
 constexpr double kRoad = 5.5, kKerb = 5.75, kPavement = 8.8;  // m from the middle line
 constexpr double kEdgeLine = 3.6, kLineHalf = 0.07;
 constexpr double kDashPeriod = 6.0, kDash = 3.0;
-constexpr double kStainsAcross[2] = {29.0, 5.3};  // m covered by the stains' texture, twice over
+constexpr double kStainsAcross = 23.0;  // m covered by the stains' texture
 
 Footprint scaled(const Footprint& f, double across) {
   const float s = static_cast<float>(1.0 / across);
@@ -50,9 +50,7 @@ double markings(const StreetPlace& place, double across, double along) {
 }  // namespace
 
 float stains(const Town& town, double u_m, double v_m, const Footprint& footprint_m) {
-  float out = 0.55f;
-  for (const double across : kStainsAcross) out += tiled(town, kStains, u_m, v_m, across, footprint_m)[0] * (0.45f / 255);
-  return out;
+  return 0.6f + (0.8f / 255.0f) * tiled(town, kStains, u_m, v_m, kStainsAcross, footprint_m)[0];
 }
 
 Rgb ground_colour(const Town& town, double x, double z, const GroundFootprint& f) {

@@ -89,7 +89,7 @@ class Renderer {
   }
 
   Rgb mean_colour(int x, int y) const {
-    constexpr int kRays = 3;
+    constexpr int kRays = 2;
     Rgb sum{};
     for (int i = 0; i < kRays * kRays; ++i) {
       const auto within = [](int k) { return 0.5 + kFilter * ((k + 0.5) / kRays - 0.5); };

@@ -23,7 +23,7 @@ struct Images {
   double* depth_m;    // height x width, along the optical axis, of the ray through the pixel centre; 0 = nothing hit
 };
 
-// Depth is exact. Colour is the mean over the pixel: textures are filtered by its footprint, and 3x3 rays are cast
+// Depth is exact. Colour is the mean over the pixel: textures are filtered by its footprint, and 2x2 rays are cast
 // where faces meet.
 void render(const Town& town, const std::vector<Body>& moving, const View& view, int num_threads, const Images& out);
 

@@ -31,6 +31,20 @@ bool clipped(double origin, double direction, double low, double high, double& e
   return enter <= leave;
 }
 
+// A ray, and its length on the ground for t = 1.
+struct Ray {
+  Point origin, direction;
+  double ground_length;
+};
+
+double ground_length(Point direction) { return std::sqrt(direction.x * direction.x + direction.z * direction.z); }
+
+// Whether the ray passes within a body's reach, seen from above.
+bool passes(const Body& b, const Ray& ray) {
+  const double x = b.x - ray.origin.x, z = b.z - ray.origin.z;
+  return std::abs(x * ray.direction.z - z * ray.direction.x) <= b.reach_m * ray.ground_length;
+}
+
 // Ray in the coordinates of a body: turned, and from its middle on the ground.
 struct LocalRay {
   Point origin, direction;
@@ -90,13 +104,14 @@ bool ellipsoid_hit(const Body& b, const LocalRay& ray, Hit& best, int index) {
   return true;
 }
 
-void body_hit(const Body& b, Point origin, Point direction, Hit& best, int index) {
-  const LocalRay ray = local(b, origin, direction);
+void body_hit(const Body& b, const Ray& whole, Hit& best, int index) {
+  if (!passes(b, whole)) return;
+  const LocalRay ray = local(b, whole.origin, whole.direction);
   bool found = false;
   if (b.kind == Kind::kBox) found = box_hit(b, ray, best, index);
   if (b.kind == Kind::kCylinder) found = cylinder_hit(b, ray, best, index);
   if (b.kind == Kind::kEllipsoid) found = ellipsoid_hit(b, ray, best, index);
-  if (found && best.face < kTop && origin.h + best.t * direction.h < b.foot_m) best.face += kFoot;
+  if (found && best.face < kTop && whole.origin.h + best.t * whole.direction.h < b.foot_m) best.face += kFoot;
 }
 
 CellTable::Bounds bounds_of(const Body& b) {
@@ -177,13 +192,15 @@ Hit Town::cast(Point origin, Point direction, const std::vector<Body>& moving) c
   double limit = best.t;
   if (direction.h > 0.0) limit = std::min(limit, std::max(highest_ - origin.h, 0.0) / direction.h);
   cast_static(origin, direction, limit, best);
+  const Ray ray{origin, direction, ground_length(direction)};
   for (std::size_t i = 0; i < moving.size(); ++i) {
-    body_hit(moving[i], origin, direction, best, static_cast<int>(bodies_.size() + i));
+    body_hit(moving[i], ray, best, static_cast<int>(bodies_.size() + i));
   }
   return best;
 }
 
 void Town::cast_static(Point origin, Point direction, double limit, Hit& best) const {
+  const Ray ray{origin, direction, ground_length(direction)};
   constexpr double kCell = CellTable::kCell, kNever = std::numeric_limits<double>::infinity();
   int x = cell_of(origin.x), z = cell_of(origin.z);
   const int step_x = direction.x < 0.0 ? -1 : 1, step_z = direction.z < 0.0 ? -1 : 1;
@@ -192,7 +209,7 @@ void Town::cast_static(Point origin, Point direction, double limit, Hit& best) c
   };
   for (double entered = 0.0; entered < std::min(limit, best.t);) {
     const CellTable::Range range = body_cells_.at(x, z);
-    for (const int* i = range.begin; i != range.end; ++i) body_hit(bodies_[*i], origin, direction, best, *i);
+    for (const int* i = range.begin; i != range.end; ++i) body_hit(bodies_[*i], ray, best, *i);
     const double leave_x = to_border(x, step_x, origin.x, direction.x);
     const double leave_z = to_border(z, step_z, origin.z, direction.z);
     entered = std::min(leave_x, leave_z);

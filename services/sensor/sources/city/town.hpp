@@ -40,6 +40,7 @@ struct Body {
   double foot_m;       // 0: none
   raycast::Rgb tint;   // multiplies the texture, not the foot's
   double shift;        // moves stains, so that no two bodies have the same
+  double reach_m;      // from the middle to the farthest point of the outline on the ground
 };
 
 // A straight piece of a street's middle line.
