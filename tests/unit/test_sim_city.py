@@ -145,7 +145,9 @@ def test_a_trajectory_gives_place_and_heading(tmp_path: Path) -> None:
     assert isinstance(source, SimCity)
     poses = source.ground_truth()
     np.testing.assert_allclose(poses[:, [0, 2], 3], places, atol=1e-9)
-    np.testing.assert_allclose(np.arctan2(poses[:, 0, 2], poses[:, 2, 2]), np.arctan2(np.sin(headings), np.cos(headings)))
+    np.testing.assert_allclose(
+        np.arctan2(poses[:, 0, 2], poses[:, 2, 2]), np.arctan2(np.sin(headings), np.cos(headings))
+    )
     for index in (0, 50, 90, 130):
         depth = source.frame(index).depth_m()
         assert depth[depth > 0].min() > 1.0

@@ -130,7 +130,8 @@ DAMAGES: dict[str, tuple[Callable[[KittiRecording], object], str]] = {
     ),
     "cameras the wrong way round": (
         lambda r: (r.folder / "calib.txt").write_text(
-            matrix_line("P0", [9, 0, 1, 0, 0, 9, 1, 0, 0, 0, 1, 0]) + matrix_line("P1", [9, 0, 1, 9, 0, 9, 1, 0, 0, 0, 1, 0])
+            matrix_line("P0", [9, 0, 1, 0, 0, 9, 1, 0, 0, 0, 1, 0])
+            + matrix_line("P1", [9, 0, 1, 9, 0, 9, 1, 0, 0, 0, 1, 0])
         ),
         "calib.txt: expected P1 to the right of P0",
     ),

@@ -146,8 +146,10 @@ class KittiSource:
 
 
 def open_kitti(uri: SourceUri) -> KittiSource:
-    """Open a sequence; options ``depth=stereo|lidar``, ``images=color|gray`` (default: colour where it is there) and
-    ``densify`` (pixels around a laser point that take its depth where they have none).
+    """Open a sequence.
+
+    Options: ``depth=stereo|lidar``, ``images=color|gray`` (default: colour where it is there) and ``densify`` (pixels
+    around a laser point that take its depth where they have none).
 
     Raises:
         SourceError: Something is missing, damaged or inconsistent; image contents are checked when read.

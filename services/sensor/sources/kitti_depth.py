@@ -56,7 +56,9 @@ def _disparity(left: Gray, right: Gray, disparities: int) -> Depth:
         mode=cv2.STEREO_SGBM_MODE_SGBM,
     )
     # Padded, or the first columns, as many as there are disparities, would have none.
-    wide = [cv2.copyMakeBorder(np.ascontiguousarray(x), 0, 0, disparities, 0, cv2.BORDER_CONSTANT) for x in (left, right)]
+    wide = [
+        cv2.copyMakeBorder(np.ascontiguousarray(x), 0, 0, disparities, 0, cv2.BORDER_CONSTANT) for x in (left, right)
+    ]
     return np.asarray(matcher.compute(wide[0], wide[1])[:, disparities:], np.float32) / np.float32(16.0)
 
 
@@ -71,7 +73,9 @@ def read_scan(path: Path) -> npt.NDArray[np.float32]:
     except OSError as error:
         raise SourceError(f"{path}: expected a laser scan, found {error.strerror}") from error
     if not data or len(data) % _SCAN_ROW_BYTES:
-        raise SourceError(f"{path}: expected a whole number of points of {_SCAN_ROW_BYTES} bytes, found {len(data)} bytes")
+        raise SourceError(
+            f"{path}: expected a whole number of points of {_SCAN_ROW_BYTES} bytes, found {len(data)} bytes"
+        )
     points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3]
     if not np.isfinite(points).all():
         raise SourceError(f"{path}: expected finite coordinates, found others")

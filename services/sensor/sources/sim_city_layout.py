@@ -218,4 +218,6 @@ def _lamp(at: tuple[float, float], side: float, way: tuple[float, float]) -> Ite
     yield _round(CYLINDER, at, 0.09, 0.0, 5.6, metal)
     reach = -side * 0.8
     head = (at[0] + reach * way[1], at[1] - reach * way[0])
-    yield Body(kind=BOX, place=(*head, -way[1], way[0], 0.9, 0.12, 5.5, 5.7), side=metal, end=metal, foot=metal, shift=at[0])
+    yield Body(
+        kind=BOX, place=(*head, -way[1], way[0], 0.9, 0.12, 5.5, 5.7), side=metal, end=metal, foot=metal, shift=at[0]
+    )

@@ -68,7 +68,9 @@ def _clouds(brush: Brush) -> Texels:
 def _asphalt(brush: Brush) -> Texels:
     """Asphalt with patches, cracks and covers."""
     size, rng = 1024, brush.rng("asphalt")
-    weight = 0.5 + 0.13 * brush.grain((size, size), "asphalt") + 0.12 * brush.noise((size, size), (4, 4), 6, 0.8, "road")
+    weight = (
+        0.5 + 0.13 * brush.grain((size, size), "asphalt") + 0.12 * brush.noise((size, size), (4, 4), 6, 0.8, "road")
+    )
     image = blend((0.20, 0.20, 0.21), (0.50, 0.49, 0.47), weight)
     for _ in range(9):
         a = rng.integers(20, 760, 2)
@@ -117,7 +119,9 @@ def _wall(brush: Brush, name: str, k: int) -> Image:
     weight = 0.5 + 0.13 * brush.grain(size, name) + 0.10 * brush.noise(size, (4, 4), 5, 0.8, name + " wall")
     if k % 3 == 1:
         row = np.arange(_SIZE) // 8
-        weight = weight + brush.rng(name).uniform(-0.2, 0.2, (64, 32)).astype(np.float32)[row[:, None], row[None, :] // 2]
+        weight = (
+            weight + brush.rng(name).uniform(-0.2, 0.2, (64, 32)).astype(np.float32)[row[:, None], row[None, :] // 2]
+        )
         weight[np.arange(_SIZE) % 8 == 0] += np.float32(0.25)
     if k % 3 == 2:
         weight[np.arange(_SIZE) % 64 < 2] -= np.float32(0.35)

@@ -10,6 +10,7 @@ from vtslam.services.sensor.sources.sim_city_path import CRUISE_M, Path
 
 _BESIDE_M = 2.45  # to the left of the path
 _IN_SIGHT_M = 120.0  # along the path
+_KEY, _MASK = zlib.crc32(b"traffic"), 2**64 - 1  # car numbers may be negative, counters not
 
 
 class Traffic:
@@ -36,13 +37,12 @@ class Traffic:
         return [body for number in range(first, last + 1) for body in self._car(number, driven_m)]
 
     def _car(self, number: int, driven_m: float) -> list[Body]:
-        rng = np.random.Generator(np.random.Philox(key=[self._seed, zlib.crc32(b"traffic")], counter=number & (2**64 - 1)))
+        rng = np.random.Generator(np.random.Philox(key=[self._seed, _KEY], counter=number & _MASK))
         at_m = (number + float(rng.uniform(0.0, 0.8))) * self._spacing_m - driven_m
         if not 0.0 < at_m < self._driven_m[-1]:
             return []
         x, z, heading = (
-            float(np.interp(at_m, self._driven_m, values))
-            for values in (*self._path.places_m.T, self._path.headings)
+            float(np.interp(at_m, self._driven_m, values)) for values in (*self._path.places_m.T, self._path.headings)
         )
         way = (float(np.sin(heading)), float(np.cos(heading)))
         middle = (x - _BESIDE_M * way[1], z + _BESIDE_M * way[0])

@@ -38,7 +38,8 @@ city::Body body(int kind, const double* p, const int* skin, const double* look, 
   require(kind >= 0 && kind < city::kNumKinds, "kind must be 0 (box), 1 (cylinder) or 2 (ellipsoid)");
   for (int i = 0; i < kPlaceColumns; ++i) require(std::isfinite(p[i]), "places must be finite");
   require(p[4] > 0.0 && p[5] > 0.0 && p[7] > p[6], "bodies must have positive sizes");
-  for (int i = 0; i < 3; ++i) require(skin[i] >= 0 && skin[i] < num_textures, "a skin names a texture that is not there");
+  for (int i = 0; i < 3; ++i)
+    require(skin[i] >= 0 && skin[i] < num_textures, "a skin names a texture that is not there");
   for (int i = 0; i < 6; ++i) require(look[i] > 0.0, "textures must cover a positive size");
   const raycast::Rgb tint{static_cast<float>(look[7]), static_cast<float>(look[8]), static_cast<float>(look[9]), 0.0f};
   return {static_cast<city::Kind>(kind),
@@ -62,7 +63,8 @@ city::Body body(int kind, const double* p, const int* skin, const double* look, 
 std::vector<city::Body> bodies(const Kinds& kind, const Places& place, const Skins& skin, const Looks& look,
                                int num_textures) {
   const std::size_t n = kind.shape(0);
-  require(place.shape(0) == n && skin.shape(0) == n && look.shape(0) == n, "kind, place, skin and look must be as long");
+  require(place.shape(0) == n && skin.shape(0) == n && look.shape(0) == n,
+          "kind, place, skin and look must be as long");
   std::vector<city::Body> out;
   for (std::size_t i = 0; i < n; ++i) {
     out.push_back(body(kind.data()[i], place.data() + kPlaceColumns * i, skin.data() + 3 * i,

@@ -59,12 +59,12 @@ Rgb ground_colour(const Town& town, double x, double z, const GroundFootprint& f
   const StreetPlace place = town.street_at(x, z);
   double road = 0.0, kerb = 0.0, pavement = 0.0, paint = 0.0;
   if (place.near) {
-    const double along = std::max(std::abs(f.dx_x * place.way_x + f.dx_z * place.way_z) +
-                                      std::abs(f.dy_x * place.way_x + f.dy_z * place.way_z),
-                                  1e-3);
-    const double across = std::max(std::abs(f.dx_z * place.way_x - f.dx_x * place.way_z) +
-                                       std::abs(f.dy_z * place.way_x - f.dy_x * place.way_z),
-                                   1e-3);
+    const double along = std::max(
+        std::abs(f.dx_x * place.way_x + f.dx_z * place.way_z) + std::abs(f.dy_x * place.way_x + f.dy_z * place.way_z),
+        1e-3);
+    const double across = std::max(
+        std::abs(f.dx_z * place.way_x - f.dx_x * place.way_z) + std::abs(f.dy_z * place.way_x - f.dy_x * place.way_z),
+        1e-3);
     road = covered(place.beside_m, across, -kRoad, kRoad);
     kerb = covered(place.beside_m, across, kRoad, kKerb);
     pavement = covered(place.beside_m, across, kKerb, kPavement);
@@ -73,7 +73,8 @@ Rgb ground_colour(const Town& town, double x, double z, const GroundFootprint& f
   const double grass = std::max(1.0 - road - kerb - pavement, 0.0);
   Rgb out{};
   if (road > 0.0) out = out + static_cast<float>(road) * tiled(town, kAsphalt, x, z, 8.3, footprint);
-  if (kerb > 0.0) out = out + static_cast<float>(kerb) * (Rgb{40, 40, 38, 0} + tiled(town, kPaving, x, z, 3.1, footprint));
+  if (kerb > 0.0)
+    out = out + static_cast<float>(kerb) * (Rgb{40, 40, 38, 0} + tiled(town, kPaving, x, z, 3.1, footprint));
   if (pavement > 0.0) out = out + static_cast<float>(pavement) * tiled(town, kPaving, x, z, 4.7, footprint);
   if (grass > 0.0) out = out + static_cast<float>(grass) * tiled(town, kGrass, x, z, 5.9, footprint);
   const Rgb white{215, 213, 205, 0};

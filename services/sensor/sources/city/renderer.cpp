@@ -27,7 +27,9 @@ struct Skin {
 
 Skin skin(const Body& b, int face, Point p) {
   const double x = b.cosine * (p.x - b.x) + b.sine * (p.z - b.z), z = b.cosine * (p.z - b.z) - b.sine * (p.x - b.x);
-  const auto world = [&](double lx, double lz) { return Point{b.cosine * lx - b.sine * lz, 0.0, b.sine * lx + b.cosine * lz}; };
+  const auto world = [&](double lx, double lz) {
+    return Point{b.cosine * lx - b.sine * lz, 0.0, b.sine * lx + b.cosine * lz};
+  };
   const Point down{0.0, -1.0, 0.0};
   if (face == kTop || face == kBottom) return {{0.0, face == kTop ? 1.0 : -1.0, 0.0}, world(1, 0), world(0, 1), x, z};
   const int side = face & 7;
@@ -41,7 +43,8 @@ Skin skin(const Body& b, int face, Point p) {
   const Point out = world(x / radius, z / radius), around = world(-z / radius, x / radius);
   const double turned = raycast::polar_angle(z, x) * b.half_x;
   if (b.kind == Kind::kCylinder) return {out, around, down, turned, b.high - p.h};
-  const double half = 0.5 * (b.high - b.low), rise = (p.h - b.low - half) / half / half, flat = radius / b.half_x / b.half_x;
+  const double half = 0.5 * (b.high - b.low), rise = (p.h - b.low - half) / half / half,
+               flat = radius / b.half_x / b.half_x;
   const double length = std::sqrt(rise * rise + flat * flat);
   const Point normal = (1.0 / length) * (flat * out + Point{0.0, rise, 0.0});
   const Point along = (1.0 / length) * (rise * out - Point{0.0, flat, 0.0});
@@ -163,8 +166,10 @@ void render(const Town& town, const std::vector<Body>& moving, const View& view,
   const auto rows = [&](int band, const auto& body) {
     for (int y = band * kRowsAtOnce; y < std::min(view.height, (band + 1) * kRowsAtOnce); ++y) body(y);
   };
-  raycast::parallel_for(bands, num_threads, [&](int band) { rows(band, [&](int y) { renderer.cast_row(y, out.depth_m); }); });
-  raycast::parallel_for(bands, num_threads, [&](int band) { rows(band, [&](int y) { renderer.colour_row(y, out.rgb); }); });
+  raycast::parallel_for(bands, num_threads,
+                        [&](int band) { rows(band, [&](int y) { renderer.cast_row(y, out.depth_m); }); });
+  raycast::parallel_for(bands, num_threads,
+                        [&](int band) { rows(band, [&](int y) { renderer.colour_row(y, out.rgb); }); });
 }
 
 }  // namespace city

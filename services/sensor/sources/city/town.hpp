@@ -34,13 +34,13 @@ struct Body {
   double x, z;          // middle
   double cosine, sine;  // of the turn: local x points to (cosine, sine) on the ground
   double half_x, half_z;
-  double low, high;    // heights of bottom and top
-  Cover side, end;     // faces across local z (and round ones), faces across local x
-  Cover foot;          // sides below foot_m
-  double foot_m;       // 0: none
-  raycast::Rgb tint;   // multiplies the texture, not the foot's
-  double shift;        // moves stains, so that no two bodies have the same
-  double reach_m;      // from the middle to the farthest point of the outline on the ground
+  double low, high;   // heights of bottom and top
+  Cover side, end;    // faces across local z (and round ones), faces across local x
+  Cover foot;         // sides below foot_m
+  double foot_m;      // 0: none
+  raycast::Rgb tint;  // multiplies the texture, not the foot's
+  double shift;       // moves stains, so that no two bodies have the same
+  double reach_m;     // from the middle to the farthest point of the outline on the ground
 };
 
 // A straight piece of a street's middle line.
@@ -51,8 +51,8 @@ struct Street {
 
 // Place of a ground point beside the nearest street.
 struct StreetPlace {
-  bool near;       // whether there is a street within kVerge
-  double beside_m; // distance from the middle line
+  bool near;        // whether there is a street within kVerge
+  double beside_m;  // distance from the middle line
   double along_m;
   double way_x, way_z;  // unit direction of the street
 };
