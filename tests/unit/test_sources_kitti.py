@@ -56,7 +56,8 @@ def test_stereo_depth_of_a_wall(recording: KittiRecording) -> None:
 
 def test_pixels_that_the_right_camera_does_not_see_have_no_depth() -> None:
     rng = np.random.default_rng(5)
-    far, near = (cv2.GaussianBlur(rng.integers(0, 255, (80, 240)).astype(np.uint8), (3, 3), 0) for _ in range(2))
+    noise = rng.integers(0, 255, (2, 80, 240)).astype(np.uint8)
+    far, near = (np.asarray(cv2.GaussianBlur(plane, (3, 3), 0), np.uint8) for plane in noise)
     left, right = far[:, :200].copy(), far[:, 4:204].copy()  # 4 px of disparity behind ...
     left[20:60, 100:160] = near[20:60, 100:160]
     right[20:60, 88:148] = near[20:60, 100:160]  # ... and 12 px in front

@@ -173,14 +173,14 @@ def car(middle: tuple[float, float], way: tuple[float, float], look: int) -> lis
     low, high = 0.84 + 0.10 * (look // 7 % 5) / 4, 1.36 + 0.3 * (look // 35 % 7) / 6
     back = -0.25 + 0.3 * (look // 245 % 3) / 2
     cabin = (middle[0] + back * way[0], middle[1] + back * way[1])
-    end = Cover("front", 2 * wide, low - 0.12)
+    side, end = Cover(f"car{look % NUM_CARS}", 2 * long, low - 0.12), Cover("front", 2 * wide, low - 0.12)
+    glass, glass_end = Cover("cabin", 2.3, high - low), Cover("cabin", 2 * wide, high - low)
     shift = float(look % 1009)
+    lower, upper = (*middle, *way, long, wide, 0.12, low), (*cabin, *way, 1.15, wide - 0.09, low, high)
     return [
-        Body(kind=BOX, place=(*middle, *way, long, wide, 0.12, low), side=Cover(f"car{look % NUM_CARS}", 2 * long, low - 0.12),
-             end=end, foot=end, tint=tint, shift=shift),
-        Body(kind=BOX, place=(*cabin, *way, 1.15, wide - 0.09, low, high), side=Cover("cabin", 2.3, high - low),
-             end=Cover("cabin", 2 * wide, high - low), foot=end, tint=tint, shift=shift),
-    ]  # fmt: skip
+        Body(kind=BOX, place=lower, side=side, end=end, foot=end, tint=tint, shift=shift),
+        Body(kind=BOX, place=upper, side=glass, end=glass_end, foot=end, tint=tint, shift=shift),
+    ]
 
 
 def _trees_and_lamps(line: Points, site: _Site, rng: np.random.Generator) -> Iterator[Body]:

@@ -168,7 +168,8 @@ def _shop(brush: Brush, k: int) -> Texels:
     """A ground floor: shop windows, doors, signs."""
     name = f"shop{k}"
     rng = brush.rng(name)
-    texels = cv2.resize(_texels(_wall(brush, name, k + 2)), (1024, 256), interpolation=cv2.INTER_LINEAR)
+    wall = _texels(_wall(brush, name, k + 2))
+    texels = np.asarray(cv2.resize(wall, (1024, 256), interpolation=cv2.INTER_LINEAR), np.uint8)
     for part in range(4):
         left = 256 * part
         colour = tuple(int(c) for c in rng.integers(30, 220, 3))
@@ -188,7 +189,7 @@ def _shop(brush: Brush, k: int) -> Texels:
             cv2.rectangle(texels, (left + 42, 66), (left + 90, 130), (60, 66, 72), -1)
             _window(texels, rng, (left + 140, 70, left + 220, 170), (90, 84, 78))
     cv2.rectangle(texels, (0, 240), (1024, 255), (92, 88, 82), -1)
-    return np.asarray(texels, np.uint8)
+    return texels
 
 
 def _painted(brush: Brush, name: str, size: tuple[int, int]) -> Texels:
