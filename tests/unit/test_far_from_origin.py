@@ -12,7 +12,6 @@ from vtslam.common.section import Section
 from vtslam.common.splat.native_engine import NativeEngine
 from vtslam.services.sensor.sources.sim_city import SimCity
 from vtslam.services.system import FrameReport, System
-from vtslam.services.tracker.state import ExternalPose
 
 FRAMES = 9
 SETTINGS = (
@@ -40,8 +39,9 @@ def run_from(T_world_first: npt.NDArray[np.float64]) -> tuple[list[FrameReport],
     settings = load_settings(family="kitti", assignments=SETTINGS)
     archive, source = _Archive(), SimCity(size=(155, 47))
     system = System(settings, NativeEngine(threads=1), archive, threads=1)
-    start = ExternalPose(T_world_camera=T_world_first, covariance=np.zeros((6, 6)))
-    reports = [system.process(source.frame(i), prior=None if i else start) for i in range(FRAMES)]
+    reports = [
+        system.process(source.frame(i), known_T_world_camera=None if i else T_world_first) for i in range(FRAMES)
+    ]
     system.finish()
     return reports, archive.sections
 
