@@ -134,8 +134,7 @@ class GaussNewtonSettings:
         depth_weight: Weight of depth.
         depth_sigma_base_m: Depth noise at 0 m ...
         depth_sigma_per_m: ... and its growth with the square of depth (1/m).
-        depth_gate_sigmas: Pairs further apart than this are taken for occlusions ...
-        depth_gate_growth: ... on the finest level; on each coarser one the gate is so many times wider.
+        depth_gate_sigmas: Pairs further apart than this are taken for occlusions.
     """
 
     renders: PositiveCount = 3
@@ -150,7 +149,6 @@ class GaussNewtonSettings:
     depth_sigma_base_m: Positive = 0.002
     depth_sigma_per_m: NonNegative = 0.0015
     depth_gate_sigmas: Positive = 4.0
-    depth_gate_growth: Annotated[float, Range(1.0, 10.0)] = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -182,8 +182,7 @@ def _linearised(
         depth_sigma_base=settings.depth_sigma_base_m,
         depth_sigma_quadratic=settings.depth_sigma_per_m,
         depth_weight=settings.depth_weight * share,
-        depth_gate_sigmas=settings.depth_gate_sigmas
-        * settings.depth_gate_growth**level,  # the first guess may be far off
+        depth_gate_sigmas=settings.depth_gate_sigmas * 3.0**level,  # the first guess may be far off
         border_px=_BORDER_PX,
     )
     view, frame = reference.levels[level], observed.levels[level]
