@@ -30,7 +30,7 @@ class SourceSettings:
 
     size: str = ""
     frames: str = ""
-    noise: Literal["", "none", "kinect"] = ""
+    noise: Literal["", "none", "kinect", "stereo"] = ""
     seed: Annotated[int, Range(-1, 2**31)] = -1
 
 

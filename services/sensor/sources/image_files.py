@@ -112,6 +112,16 @@ def read_color(path: Path) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels of a PNG or JPEG file.
+
+    Raises:
+        SourceError: As :func:`read_color`.
+    """
+    height, width = read_color(path).shape[:2]
+    return width, height
+
+
 def read_depth(path: Path) -> npt.NDArray[np.uint16]:
     """A 16-bit gray PNG file as uint16 [H,W].
 

@@ -26,7 +26,17 @@ def _open_seven_scenes(uri: SourceUri, size: Size | None) -> Source:
     return open_seven_scenes(uri)
 
 
+def _open_kitti(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.kitti import open_kitti
+
+    return open_kitti(uri)
+
+
 def _open_sim(uri: SourceUri, size: Size | None) -> Source:
+    if uri.path == "city":
+        from vtslam.services.sensor.sources.sim_city import SimCity
+
+        return SimCity.open(uri, size=size)
     from vtslam.services.sensor.sources.sim_room import SimRoom
 
     return SimRoom.open(uri, size=size)
@@ -36,7 +46,8 @@ def _open_sim(uri: SourceUri, size: Size | None) -> Source:
 _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "replica": ("replica:DIR", _open_replica),
     "7scenes": ("7scenes:DIR", _open_seven_scenes),
-    "sim": ("sim:room", _open_sim),
+    "kitti": ("kitti:DIR", _open_kitti),
+    "sim": ("sim:room, sim:city", _open_sim),
 }
 
 
