@@ -11,7 +11,7 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.common.section import Section
 from vtslam.common.splat.native_engine import NativeEngine
 from vtslam.services.sensor.sources.sim_city import SimCity
-from vtslam.services.system import FrameReport, System
+from vtslam.services.system import Archive, FrameReport, System
 
 FRAMES = 9
 SETTINGS = (
@@ -24,7 +24,7 @@ SETTINGS = (
 
 
 @dataclass(slots=True)
-class _Archive:
+class _Archive(Archive):
     sections: dict[int, Section] = field(default_factory=dict)
 
     def write(self, section: Section) -> None:
