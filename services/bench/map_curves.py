@@ -66,7 +66,7 @@ def _panel(curves: Mapping[str, Any], key: str, words: str) -> Panel:
     names = ", ".join(f"{color}: {name}" for color, name in zip(_COLOR_WORDS, curves, strict=False))
     return Panel(
         title=f"{words} ({names})",
-        x_label="log10 of mapping ms per frame",
+        x_label="log10 ms/frame",
         y_label="dB",
         lines=[Line(points=each, color=color) for each, color in zip(points, _COLORS, strict=False)],
         dots=np.concatenate([np.zeros((0, 2)), *points]),
