@@ -47,7 +47,7 @@ class Source(Protocol):
         ...
 
     def ground_truth(self) -> npt.NDArray[np.float64] | None:
-        """True poses ``T_world_camera`` float64 [F,4,4], or None where the recording has none."""
+        """True poses ``T_world_camera`` float64 [F,4,4], NaN for single frames without, or None if there are none."""
         ...
 
 

@@ -32,6 +32,12 @@ def _open_kitti(uri: SourceUri, size: Size | None) -> Source:
     return open_kitti(uri)
 
 
+def _open_tum(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.tum import open_tum
+
+    return open_tum(uri)
+
+
 def _open_sim(uri: SourceUri, size: Size | None) -> Source:
     if uri.path == "city":
         from vtslam.services.sensor.sources.sim_city import SimCity
@@ -46,6 +52,7 @@ def _open_sim(uri: SourceUri, size: Size | None) -> Source:
 _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "replica": ("replica:DIR", _open_replica),
     "7scenes": ("7scenes:DIR", _open_seven_scenes),
+    "tum": ("tum:DIR", _open_tum),
     "kitti": ("kitti:DIR", _open_kitti),
     "sim": ("sim:room, sim:city", _open_sim),
 }
