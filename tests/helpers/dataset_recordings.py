@@ -1,9 +1,13 @@
 """Small synthetic recordings on disk, in the layouts of TUM RGB-D, ScanNet and ScanNet++."""
 
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from helpers.recordings import Depth, Poses, Rgb, camera_path, images, write_png
+import cv2
+import numpy as np
+from helpers.recordings import Depth, Poses, Rgb, camera_path, images, pose_row, write_png
 
 from vtslam.common.geometry import se3
 
@@ -59,3 +63,101 @@ def write_tum(folder: Path, *, num_frames: int = 3, interval_s: float = 0.04) ->
         write_png(recording.depth_path(index), depth[index])
     recording.write_list("groundtruth.txt", recording.truth_lines())
     return recording
+
+
+SCANNET_MATRIX = np.array([[60.0, 0, 32.0, 0], [0, 62.0, 24.0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+@dataclass(slots=True, kw_only=True)
+class ScanNetRecording:
+    """An exported folder: colour 64x48, depth 32x24; frame k has the number ``k * step``."""
+
+    folder: Path
+    rgb: list[Rgb]
+    depth: list[Depth]
+    poses: Poses
+    step: int
+
+    @property
+    def uri(self) -> str:
+        return f"scannet:{self.folder}"
+
+    def color_path(self, index: int) -> Path:
+        return self.folder / "color" / f"{index * self.step}.png"
+
+    def depth_path(self, index: int) -> Path:
+        return self.folder / "depth" / f"{index * self.step}.png"
+
+    def pose_path(self, index: int) -> Path:
+        return self.folder / "pose" / f"{index * self.step}.txt"
+
+    @property
+    def intrinsics_path(self) -> Path:
+        return self.folder / "intrinsic" / "intrinsic_color.txt"
+
+
+def matrix_text(matrix: Poses) -> str:
+    return "".join(pose_row(row) + "\n" for row in matrix)
+
+
+def write_scannet(folder: Path, *, num_frames: int = 3, step: int = 1) -> ScanNetRecording:
+    """Write an exported folder, depth in mm."""
+    rgb, _ = images(num_frames, width=64, height=48)
+    _, depth = images(num_frames, width=32, height=24)
+    recording = ScanNetRecording(folder=folder, rgb=rgb, depth=depth, poses=camera_path(num_frames), step=step)
+    for name in ("color", "depth", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    recording.intrinsics_path.write_text(matrix_text(SCANNET_MATRIX))
+    for index in range(num_frames):
+        write_png(recording.color_path(index), rgb[index])
+        write_png(recording.depth_path(index), depth[index])
+        recording.pose_path(index).write_text(matrix_text(recording.poses[index]))
+    return recording
+
+
+@dataclass(slots=True, kw_only=True)
+class SensRecording:
+    """The parts of a ``.sens`` file, which tests change before they write it: colour 64x48 PNG, depth 32x24."""
+
+    rgb: list[Rgb]
+    depth: list[Depth]
+    poses: Poses
+    version: int = 4
+    name: bytes = b"StructureSensor"
+    color_compression: int = 1
+    depth_compression: int = 1
+    sizes: tuple[int, int, int, int] = (64, 48, 32, 24)
+    units_per_m: float = 1000.0
+    num_frames: int | None = None
+
+    def header(self) -> bytes:
+        eye = np.eye(4, dtype="<f4").tobytes()
+        matrices = SCANNET_MATRIX.astype("<f4").tobytes() + eye + SCANNET_MATRIX.astype("<f4").tobytes() + eye
+        count = len(self.rgb) if self.num_frames is None else self.num_frames
+        images = (self.color_compression, self.depth_compression, *self.sizes, self.units_per_m, count)
+        start = struct.pack("<IQ", self.version, len(self.name)) + self.name
+        return start + matrices + struct.pack("<iiIIIIfQ", *images)
+
+    def color_bytes(self, index: int) -> bytes:
+        return bytes(cv2.imencode(".png", self.rgb[index][..., ::-1])[1].tobytes())
+
+    def depth_bytes(self, index: int) -> bytes:
+        raw = self.depth[index].astype("<u2").tobytes()
+        return zlib.compress(raw) if self.depth_compression == 1 else raw
+
+    def frame(self, index: int, *, color: bytes | None = None, depth: bytes | None = None) -> bytes:
+        color = self.color_bytes(index) if color is None else color
+        depth = self.depth_bytes(index) if depth is None else depth
+        sizes = struct.pack("<QQQQ", 0, 0, len(color), len(depth))
+        return bytes(self.poses[index].astype("<f4").tobytes()) + sizes + color + depth
+
+    def write(self, path: Path) -> str:
+        """Write the file; the URI of it."""
+        path.write_bytes(self.header() + b"".join(self.frame(index) for index in range(len(self.rgb))))
+        return f"scannet:{path}"
+
+
+def sens_recording(num_frames: int = 3) -> SensRecording:
+    rgb, _ = images(num_frames, width=64, height=48)
+    _, depth = images(num_frames, width=32, height=24)
+    return SensRecording(rgb=rgb, depth=depth, poses=camera_path(num_frames))

@@ -129,17 +129,27 @@ def read_color(path: Path) -> npt.NDArray[np.uint8]:
     Raises:
         SourceError: The file is missing, cut, damaged, or of another kind.
     """
-    data = _read_bytes(path, "colour image")
+    return decoded_color(_read_bytes(path, "colour image"), path)
+
+
+def decoded_color(data: bytes, where: Path | str) -> npt.NDArray[np.uint8]:
+    """What :func:`read_color` gives for a file of these bytes; messages begin with ``where``.
+
+    Raises:
+        SourceError: The bytes are cut, damaged, or of another kind.
+    """
     if data.startswith(_PNG_SIGNATURE):
-        _check_png(path, data)
+        _check_png(where, data)
         if data[24] != 8:
-            raise SourceError(f"{path}: expected an 8-bit colour image, found {data[24]} bits per channel")
+            raise SourceError(f"{where}: expected an 8-bit colour image, found {data[24]} bits per channel")
     elif data.startswith(_JPEG_START):
         if not data.rstrip(b"\0").endswith(_JPEG_END):
-            raise SourceError(f"{path}: expected a whole JPEG file, found it cut after {len(data)} bytes (no end mark)")
+            raise SourceError(
+                f"{where}: expected a whole JPEG file, found it cut after {len(data)} bytes (no end mark)"
+            )
     else:
-        raise SourceError(f"{path}: expected a PNG or JPEG file, found {_head(data)}")
-    bgr = _decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        raise SourceError(f"{where}: expected a PNG or JPEG file, found {_head(data)}")
+    bgr = _decode(where, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
@@ -179,7 +189,7 @@ def _read_bytes(path: Path, what: str) -> bytes:
         raise SourceError(f"{path}: expected a readable {what}, found {error.strerror}") from error
 
 
-def _check_png(path: Path, data: bytes) -> None:
+def _check_png(path: Path | str, data: bytes) -> None:
     """Walk the chunks (length, type, payload, CRC) from IHDR to IEND."""
     at, kind = len(_PNG_SIGNATURE), b""
     while kind != b"IEND":
@@ -199,7 +209,7 @@ def _check_png(path: Path, data: bytes) -> None:
         at = end
 
 
-def _decode(path: Path, data: bytes, flags: int) -> npt.NDArray[np.generic]:
+def _decode(path: Path | str, data: bytes, flags: int) -> npt.NDArray[np.generic]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:

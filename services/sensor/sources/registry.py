@@ -38,6 +38,12 @@ def _open_tum(uri: SourceUri, size: Size | None) -> Source:
     return open_tum(uri)
 
 
+def _open_scannet(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.scannet import open_scannet
+
+    return open_scannet(uri)
+
+
 def _open_sim(uri: SourceUri, size: Size | None) -> Source:
     if uri.path == "city":
         from vtslam.services.sensor.sources.sim_city import SimCity
@@ -53,6 +59,7 @@ _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "replica": ("replica:DIR", _open_replica),
     "7scenes": ("7scenes:DIR", _open_seven_scenes),
     "tum": ("tum:DIR", _open_tum),
+    "scannet": ("scannet:DIR|FILE.sens", _open_scannet),
     "kitti": ("kitti:DIR", _open_kitti),
     "sim": ("sim:room, sim:city", _open_sim),
 }
