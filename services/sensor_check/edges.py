@@ -44,7 +44,7 @@ def color_edges(gray: Gray) -> npt.NDArray[np.float32]:
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
     strength = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
     around = cv2.blur(strength, (31, 31)) + _SMALLEST_CONTRAST
-    return np.minimum(strength / around, 4.0).astype(np.float32)
+    return np.asarray(np.minimum(strength / around, 4.0), np.float32)
 
 
 def depth_edges(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -1,9 +1,11 @@
 """Small synthetic recordings on disk, in the layouts of TUM RGB-D, ScanNet and ScanNet++."""
 
+import json
 import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -161,3 +163,59 @@ def sens_recording(num_frames: int = 3) -> SensRecording:
     rgb, _ = images(num_frames, width=64, height=48)
     _, depth = images(num_frames, width=32, height=24)
     return SensRecording(rgb=rgb, depth=depth, poses=camera_path(num_frames))
+
+
+@dataclass(slots=True, kw_only=True)
+class ScanNetPpRecording:
+    """``dslr`` with three training images, of which the order is not that of their names, and two held-out ones."""
+
+    folder: Path
+    names: list[str]
+    rgb: list[Rgb]
+    depth: list[Depth]
+    poses: Poses
+
+    @property
+    def uri(self) -> str:
+        return f"scannetpp:{self.folder}"
+
+    @property
+    def transforms_path(self) -> Path:
+        return self.folder / "dslr" / "nerfstudio" / "transforms_undistorted.json"
+
+    @property
+    def lists_path(self) -> Path:
+        return self.folder / "dslr" / "train_test_lists.json"
+
+    def color_path(self, index: int) -> Path:
+        return self.folder / "dslr" / "undistorted_images" / self.names[index]
+
+    def depth_path(self, index: int) -> Path:
+        return self.folder / "dslr" / "undistorted_depths" / Path(self.names[index]).with_suffix(".png")
+
+    def transforms(self) -> dict[str, Any]:
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])
+        frames = [
+            {"file_path": name, "transform_matrix": (flip @ T @ flip).tolist(), "is_bad": False}
+            for name, T in zip(self.names, self.poses, strict=True)
+        ]
+        size = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 32.0, "cy": 24.0}
+        return {**size, "camera_model": "PINHOLE", "frames": frames[2::-1], "test_frames": frames[3:]}
+
+    def write_json(self, transforms: object, lists: object) -> None:
+        self.transforms_path.write_text(json.dumps(transforms))
+        self.lists_path.write_text(json.dumps(lists))
+
+
+def write_scannetpp(folder: Path) -> ScanNetPpRecording:
+    """Write a scene: images 64x48 (PNG data), depth in mm."""
+    rgb, depth = images(5, width=64, height=48)
+    names = [f"DSC0{number}.JPG" for number in (1752, 1750, 1751, 1790, 1791)]
+    recording = ScanNetPpRecording(folder=folder, names=names, rgb=rgb, depth=depth, poses=camera_path(5))
+    for name in ("nerfstudio", "undistorted_images", "undistorted_depths"):
+        (folder / "dslr" / name).mkdir(parents=True)
+    for index in range(5):
+        recording.color_path(index).write_bytes(cv2.imencode(".png", rgb[index][..., ::-1])[1].tobytes())
+        write_png(recording.depth_path(index), depth[index])
+    recording.write_json(recording.transforms(), {"train": names[:3], "test": names[3:]})
+    return recording

@@ -44,6 +44,15 @@ def _open_scannet(uri: SourceUri, size: Size | None) -> Source:
     return open_scannet(uri)
 
 
+def _open_scannetpp(uri: SourceUri, size: Size | None) -> Source:
+    """At half size unless another is asked for, as the paper does."""
+    from vtslam.services.sensor.sources.scannetpp import open_scannetpp
+
+    source = open_scannetpp(uri)
+    half = max(1, source.camera.width // 2), max(1, source.camera.height // 2)
+    return source if size is not None else _resized(source, half)
+
+
 def _open_sim(uri: SourceUri, size: Size | None) -> Source:
     if uri.path == "city":
         from vtslam.services.sensor.sources.sim_city import SimCity
@@ -60,6 +69,7 @@ _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "7scenes": ("7scenes:DIR", _open_seven_scenes),
     "tum": ("tum:DIR", _open_tum),
     "scannet": ("scannet:DIR|FILE.sens", _open_scannet),
+    "scannetpp": ("scannetpp:DIR", _open_scannetpp),
     "kitti": ("kitti:DIR", _open_kitti),
     "sim": ("sim:room, sim:city", _open_sim),
 }
