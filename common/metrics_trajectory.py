@@ -70,8 +70,8 @@ def aligning_motion(points: npt.NDArray[np.float64], targets: npt.NDArray[np.flo
 def _step_errors(estimated: Poses, truth: Poses) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Translation (m) and angle (rad) of ``inverse(true step) @ estimated step``, of the steps that are known."""
     errors = []
-    known = np.isfinite(truth.reshape(-1, 16)).all(axis=1)
-    for t in np.flatnonzero(known[:-1] & known[1:]):
+    known = [bool(np.isfinite(T).all()) for T in truth]
+    for t in (t for t in range(len(truth) - 1) if known[t] and known[t + 1]):
         true_step = se3.inverse(truth[t]) @ truth[t + 1]
         errors.append(se3.inverse(true_step) @ se3.inverse(estimated[t]) @ estimated[t + 1])
     trans_m = np.array([np.linalg.norm(error[:3, 3]) for error in errors])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 SOURCE_HELP = (
     "where frames come from: replica:DIR, 7scenes:DIR, tum:DIR, scannet:DIR|FILE.sens, scannetpp:DIR, "
-    "kitti:DIR, sim:room, sim:city"
+    "realsense:, kitti:DIR, sim:room, sim:city"
 )
 _JSON_HELP = "write the result as JSON (- for standard output)"
 

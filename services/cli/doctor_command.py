@@ -6,6 +6,7 @@ import shutil
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -45,12 +46,17 @@ def doctor_command(args: Namespace) -> int:
 
 def _examine_source(uri: str, console: Console) -> int:
     """Examine a recording; 0 if nothing is wrong with it."""
+    from vtslam.services.sensor.sources.base import live_camera
     from vtslam.services.sensor.sources.registry import open_source
-    from vtslam.services.sensor_check.examination import burst_starts, examine
+    from vtslam.services.sensor_check.examination import FRAMES, burst_starts, examine
 
     source = open_source(uri)
-    places = burst_starts(len(source))
-    with Progress(sum(map(len, places)), what="looking", unit="frame") as progress:
+    camera = live_camera(source)
+    places = burst_starts(len(source) if camera is None else FRAMES)
+    with ExitStack() as stack:
+        if camera is not None:
+            stack.callback(camera.close)
+        progress = stack.enter_context(Progress(sum(map(len, places)), what="looking", unit="frame"))
 
         def looked_at(index: int) -> Frame:
             progress.step()

@@ -23,6 +23,7 @@ from vtslam.services.sensor_check.motion import (
 NEIGHBOURS = 4  # frames before and after the middle one of a burst
 BURST = 2 * NEIGHBOURS + 1
 _BURSTS = 16
+FRAMES = _BURSTS * BURST  # that are looked at, at most
 _REDUCED_WIDTH = 400  # images are reduced by a whole number to at most this
 _BLANK_LEVELS = 3.0  # standard deviation of gray, 0..255
 _BLANK_DEPTH_SHARE = 0.01

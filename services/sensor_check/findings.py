@@ -117,8 +117,8 @@ def _alignment(evidence: "Evidence") -> list[CheckFinding]:
     if seen is None or not seen.clear:
         text = "cannot be told: edges of colour and depth do not agree anywhere, or are too few"
         return [CheckFinding(name=name, ok=True, found=text) for name in ("registration", "time offset")]
-    shift_px = tuple(evidence.reduction * value for value in seen.shift_px)
-    apart_px = float(np.hypot(*shift_px))
+    shift_px = [evidence.reduction * value for value in seen.shift_px]
+    apart_px = float(np.linalg.norm(shift_px))
     limit_px = max(_SHIFT_SHARE * evidence.camera.width, 1.5 * evidence.reduction)
     registered = apart_px < limit_px or seen.agreement_here > 0.75
     text = f"colour lies {shift_px[0]:+.1f} px right and {shift_px[1]:+.1f} px below of depth"
@@ -150,7 +150,7 @@ def _frozen(evidence: "Evidence") -> CheckFinding:
     count = max(len(evidence.frozen_color), len(evidence.frozen_depth))
     run = max(_longest_run(evidence.frozen_color), _longest_run(evidence.frozen_depth))
     ok = run < _FROZEN_RUN and count <= max(1.0, _FROZEN_SHARE * evidence.pairs)
-    values = {"frozen": count, "longest_run": run}
+    values = {"frozen": float(count), "longest_run": float(run)}
     return CheckFinding(name="frozen frames", ok=ok, found=found, values=values)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.frame import Frame
+from vtslam.common.geometry.camera import Camera
 from vtslam.services.sensor.sources.base import Source
 
 FrameOf = Callable[[int], Frame]
@@ -20,6 +21,18 @@ class BrokenSource:
     frame_of: FrameOf
     count: int
     truth: npt.NDArray[np.float64] | None
+
+    @property
+    def uri(self) -> str:
+        return self.inner.uri
+
+    @property
+    def camera(self) -> Camera:
+        return self.frame_of(0).camera
+
+    @property
+    def depth_scale_m(self) -> float:
+        return self.frame_of(0).depth_scale_m
 
     @property
     def family(self) -> str:

@@ -12,6 +12,7 @@ from helpers.broken_recordings import FAULTS, broken, late_depth, shifted_color
 from helpers.shared_data import shared_data
 
 from vtslam.common.frame import Frame
+from vtslam.common.geometry.camera import Camera
 from vtslam.services.cli.__main__ import main
 from vtslam.services.sensor.sources.base import Source, SourceError
 from vtslam.services.sensor.sources.registry import open_source
@@ -47,7 +48,7 @@ class Kept:
         return self.inner.family
 
     @property
-    def camera(self) -> object:
+    def camera(self) -> Camera:
         return self.inner.camera
 
     @property

@@ -53,6 +53,12 @@ def _open_scannetpp(uri: SourceUri, size: Size | None) -> Source:
     return source if size is not None else _resized(source, half)
 
 
+def _open_realsense(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.realsense import open_realsense
+
+    return open_realsense(uri, size)
+
+
 def _open_sim(uri: SourceUri, size: Size | None) -> Source:
     if uri.path == "city":
         from vtslam.services.sensor.sources.sim_city import SimCity
@@ -70,6 +76,7 @@ _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "tum": ("tum:DIR", _open_tum),
     "scannet": ("scannet:DIR|FILE.sens", _open_scannet),
     "scannetpp": ("scannetpp:DIR", _open_scannetpp),
+    "realsense": ("realsense:[SERIAL]", _open_realsense),
     "kitti": ("kitti:DIR", _open_kitti),
     "sim": ("sim:room, sim:city", _open_sim),
 }
