@@ -152,8 +152,8 @@ def summarise(
 
 
 def _frame_record(quality: FrameQuality, trajectory: TrajectoryErrors | None) -> dict[str, object]:
-    error = None if trajectory is None else float(trajectory.position_error_m[quality.frame])
-    return {**asdict(quality), "position_error_m": error}
+    error = np.nan if trajectory is None else float(trajectory.position_error_m[quality.frame])
+    return {**asdict(quality), "position_error_m": None if np.isnan(error) else error}
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

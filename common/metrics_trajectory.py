@@ -12,12 +12,13 @@ Poses = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrajectoryErrors:
-    """Errors over all frames.
+    """Errors over all frames whose true pose is known.
 
     Attributes:
         ate_rmse_m, ate_mean_m: Root mean square and mean of ``position_error_m``.
         rpe_trans_rmse_m, rpe_rot_rmse_deg: Root mean squares over the F-1 steps; None for a single frame.
-        position_error_m: float64 [F], distance of each aligned camera position from the true one.
+        position_error_m: float64 [F], distance of each aligned camera position from the true one; NaN where that is
+            not known.
     """
 
     ate_rmse_m: float
@@ -30,8 +31,10 @@ class TrajectoryErrors:
 def trajectory_errors(estimated: Poses, truth: Poses) -> TrajectoryErrors:
     """ATE and RPE of ``estimated`` against ``truth``, both ``T_world_camera`` float64 [F,4,4] of the same frames.
 
+    True poses that are not finite are not known, and left out.
+
     Raises:
-        ValueError: Shapes differ, are not [F,4,4] with F >= 1, or a value is not finite.
+        ValueError: Shapes differ, are not [F,4,4] with F >= 1, an estimate is not finite, or no true pose is.
     """
     _check(estimated, truth)
     T_truth_estimate = aligning_motion(estimated[:, :3, 3], truth[:, :3, 3])
@@ -40,7 +43,7 @@ def trajectory_errors(estimated: Poses, truth: Poses) -> TrajectoryErrors:
     trans_m, rot_rad = _step_errors(estimated, truth)
     return TrajectoryErrors(
         ate_rmse_m=_rms(error_m),
-        ate_mean_m=float(error_m.mean()),
+        ate_mean_m=float(np.nanmean(error_m)),
         rpe_trans_rmse_m=_rms(trans_m) if trans_m.size else None,
         rpe_rot_rmse_deg=float(np.rad2deg(_rms(rot_rad))) if rot_rad.size else None,
         position_error_m=error_m,
@@ -50,8 +53,11 @@ def trajectory_errors(estimated: Poses, truth: Poses) -> TrajectoryErrors:
 def aligning_motion(points: npt.NDArray[np.float64], targets: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """The rigid motion ``T_target_point`` [4,4] of least squares between paired points [F,3] (Umeyama, scale 1).
 
-    For points on a line or at one place, where the rotation is not unique, it is one of those of least squares.
+    Pairs with a point that is not finite are left out. For points on a line or at one place, where the rotation is not
+    unique, it is one of those of least squares.
     """
+    known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
+    points, targets = points[known], targets[known]
     center, target_center = points.mean(axis=0), targets.mean(axis=0)
     u, _, vt = np.linalg.svd((targets - target_center).T @ (points - center))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -62,9 +68,10 @@ def aligning_motion(points: npt.NDArray[np.float64], targets: npt.NDArray[np.flo
 
 
 def _step_errors(estimated: Poses, truth: Poses) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Translation (m) and angle (rad) of ``inverse(true step) @ estimated step``, each [F-1]."""
+    """Translation (m) and angle (rad) of ``inverse(true step) @ estimated step``, of the steps that are known."""
     errors = []
-    for t in range(len(truth) - 1):
+    known = [bool(np.isfinite(T).all()) for T in truth]
+    for t in (t for t in range(len(truth) - 1) if known[t] and known[t + 1]):
         true_step = se3.inverse(truth[t]) @ truth[t + 1]
         errors.append(se3.inverse(true_step) @ se3.inverse(estimated[t]) @ estimated[t + 1])
     trans_m = np.array([np.linalg.norm(error[:3, 3]) for error in errors])
@@ -72,11 +79,11 @@ def _step_errors(estimated: Poses, truth: Poses) -> tuple[npt.NDArray[np.float64
 
 
 def _rms(values: npt.NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values * values)))
+    return float(np.sqrt(np.nanmean(values * values)))
 
 
 def _check(estimated: Poses, truth: Poses) -> None:
     if estimated.shape != truth.shape or truth.shape[1:] != (4, 4) or len(truth) < 1:
         raise ValueError(f"expected two trajectories [F,4,4] of one length, got {estimated.shape} and {truth.shape}")
-    if not (np.isfinite(estimated).all() and np.isfinite(truth).all()):
-        raise ValueError("expected finite poses in both trajectories")
+    if not (np.isfinite(estimated).all() and np.isfinite(truth).all(axis=(1, 2)).any()):
+        raise ValueError("expected finite estimated poses, and true poses of which some are finite")

@@ -99,7 +99,7 @@ def read_trajectory(path: Path) -> Trajectory:
         where = f"{path}:{number}"
         if len(words) != len(_COLUMNS):
             raise TrajectoryError(f"{where}: expected {len(_COLUMNS)} columns {' '.join(_COLUMNS)}, found {len(words)}")
-        time_ns = _time_ns(words[0], where)
+        time_ns = parse_time_ns(words[0], where)
         if times_ns and time_ns <= times_ns[-1]:
             raise TrajectoryError(f"{where}: expected a time after {_seconds(times_ns[-1])}, found {words[0]}")
         times_ns.append(time_ns)
@@ -119,7 +119,8 @@ def _seconds(time_ns: int) -> str:
     return f"{time_ns // 10**_NS_DIGITS}.{time_ns % 10**_NS_DIGITS:0{_NS_DIGITS}d}"
 
 
-def _time_ns(text: str, where: str) -> int:
+def parse_time_ns(text: str, where: str) -> int:
+    """Seconds as decimal text, in integer nanoseconds; raises TrajectoryError, whose text begins with ``where``."""
     try:
         seconds = Decimal(text)
     except InvalidOperation:

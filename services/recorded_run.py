@@ -87,9 +87,10 @@ class RecordedRun:
         )
 
     def true_poses(self) -> npt.NDArray[np.float64] | None:
-        """True ``T_world_camera`` [F,4,4] of the committed frames, or None."""
+        """True ``T_world_camera`` [F,4,4] of the committed frames, NaN where it is not known; None if nowhere."""
         truth = self.source.ground_truth()
-        return None if truth is None else truth[: self.num_frames]
+        truth = None if truth is None else truth[: self.num_frames]
+        return None if truth is None or not np.isfinite(truth).any() else truth
 
     def _check(self) -> None:
         facts = self.info.facts

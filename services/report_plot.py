@@ -59,8 +59,8 @@ def trajectory_plot(
 
     Args:
         estimated_m: Camera positions float64 [F,3], world frame of the run (x right, y down, z forward at frame 0).
-        true_m: True positions [F,3], aligned to the estimated ones, or None.
-        errors_m: Distances [F] between them, or None.
+        true_m: True positions [F,3], aligned to the estimated ones, or None; those that are NaN are left out.
+        errors_m: Distances [F] between them, or None; likewise.
         heads: Frames that open a section.
     """
     panels = [
@@ -74,8 +74,8 @@ def trajectory_plot(
                 title="position error (dots: heads)",
                 x_label="frame",
                 y_label="mm",
-                lines=[Line(points=curve, color=ESTIMATED_COLOR)],
-                dots=curve[list(heads)],
+                lines=[Line(points=_finite(curve), color=ESTIMATED_COLOR)],
+                dots=_finite(curve[list(heads)]),
                 equal_axes=False,
                 from_zero=True,
             )
@@ -98,7 +98,7 @@ def _path(
 
     lines = [Line(points=flat(estimated_m), color=ESTIMATED_COLOR)]
     if true_m is not None:
-        lines.insert(0, Line(points=flat(true_m), color=TRUE_COLOR, width_px=5))
+        lines.insert(0, Line(points=_finite(flat(true_m)), color=TRUE_COLOR, width_px=5))
     words = "" if true_m is None else " (gray: true)"
     return Panel(
         title=f"{title}{words}",
@@ -107,6 +107,10 @@ def _path(
         lines=lines,
         dots=flat(estimated_m)[list(heads)],
     )
+
+
+def _finite(points: Points) -> Points:
+    return points[np.isfinite(points).all(axis=1)]
 
 
 class _Axes:

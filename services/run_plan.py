@@ -19,7 +19,7 @@ from vtslam.services.process_facts import program_version, versions
 from vtslam.services.recording_run import run_recording
 from vtslam.services.resume import ResumePoint, prepare_to_resume
 from vtslam.services.run_record import RunRecord, RunSummary
-from vtslam.services.sensor.sources.base import Source
+from vtslam.services.sensor.sources.base import Source, SourceError, live_camera
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.processes import LIVE_SOURCE
 from vtslam.storage.errors import RunFolderError
@@ -174,6 +174,11 @@ def plan_run(
     # The source's own family is known once it is open, and how to open it is a setting, which families leave alone.
     settings = load_settings(preset=preset, family=family or "tum", file=config, assignments=assignments)
     source = open_source(uri, overrides=_source_options(settings.source))
+    if live_camera(source) is not None:
+        raise SourceError(
+            f"{source.uri}: expected a recording, found a camera; start a fleet with vtslam up, and send it the "
+            f"camera's frames with vtslam publish {source.uri}"
+        )
     family = family or source.family
     settings = load_settings(preset=preset, family=family, file=config, assignments=assignments)
     return RunPlan(source=source, settings=settings, engine=make_engine(settings.splat), preset=preset, family=family)

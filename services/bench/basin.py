@@ -49,7 +49,7 @@ def bench_basin(plan: RunPlan, *, trials: int, on_step: Callable[[], None]) -> d
         ConfigError: The recording has no true poses, or fewer than six frames.
     """
     source, truth = plan.source, plan.source.ground_truth()
-    if truth is None:
+    if truth is None or not np.isfinite(truth).all():
         raise ConfigError(f"bench basin: {source.uri} has no true poses to start from")
     mapped = len(source) - _TRACKED_FRAMES
     if mapped < _TRACKED_FRAMES:

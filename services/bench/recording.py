@@ -55,7 +55,7 @@ def bench_map(plan: RunPlan) -> dict[str, object]:
         ConfigError: The recording has no true poses.
     """
     truth = plan.source.ground_truth()
-    if truth is None:
+    if truth is None or not np.isfinite(truth).all():
         raise ConfigError(f"bench map: {plan.source.uri} has no true poses to map at")
     values, rows = _measured(plan, known_poses=truth)
     kept = (*_QUALITY, *_COSTS)
@@ -92,7 +92,9 @@ def _opencv_odometry(source: Source) -> tuple[float, float | None]:
         poses.append(poses[-1] if motion is None else poses[-1] @ motion)
         previous = frame
     truth = source.ground_truth()
-    ate_m = None if truth is None else trajectory_errors(np.stack(poses), truth).ate_rmse_m
+    ate_m = (
+        None if truth is None or not np.isfinite(truth).any() else trajectory_errors(np.stack(poses), truth).ate_rmse_m
+    )
     return median_ms(seconds), ate_m
 
 

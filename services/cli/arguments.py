@@ -3,7 +3,10 @@
 import argparse
 from pathlib import Path
 
-SOURCE_HELP = "where frames come from: replica:DIR, 7scenes:DIR, kitti:DIR, sim:room, sim:city"
+SOURCE_HELP = (
+    "where frames come from: replica:DIR, 7scenes:DIR, tum:DIR, scannet:DIR|FILE.sens, scannetpp:DIR, "
+    "realsense:, kitti:DIR, sim:room, sim:city"
+)
 _JSON_HELP = "write the result as JSON (- for standard output)"
 
 
@@ -225,7 +228,13 @@ def _add_settings(commands: "_Commands[argparse.ArgumentParser]") -> None:
 
 
 def _add_doctor(commands: "_Commands[argparse.ArgumentParser]") -> None:
-    command = _command(commands, "doctor", "check the installation and this machine", example="vtslam doctor")
+    command = _command(
+        commands,
+        "doctor",
+        "check the installation and this machine, or a recording",
+        example="vtslam doctor\n  vtslam doctor replica:DIR",
+    )
+    command.add_argument("source", nargs="?", metavar="SOURCE", help=f"look for faults of a recording; {SOURCE_HELP}")
     command.add_argument("--gpu", action="store_true", help="check the CUDA engine against the reference instead")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 

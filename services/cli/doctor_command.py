@@ -1,4 +1,4 @@
-"""``vtslam doctor``: is everything here that a run needs, and does it compute what it should?"""
+"""``vtslam doctor``: is everything here that a run needs, and does it compute what it should? Is a recording sound?"""
 
 import os
 import platform
@@ -6,11 +6,13 @@ import shutil
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from vtslam.services.cli.console import Console
+from vtslam.common.frame import Frame
+from vtslam.services.cli.console import Console, Progress
 from vtslam.services.process_facts import package_version, program_version
 
 _MIN_FREE_MB = 2000.0  # a long run at 640x480 stays below this
@@ -28,6 +30,8 @@ class Finding:
 def doctor_command(args: Namespace) -> int:
     """Examine as the arguments say; 0 if all is well."""
     console = Console(args.json)
+    if args.source is not None:
+        return _examine_source(args.source, console)
     if args.gpu:
         from vtslam.services.cli.doctor_gpu import run_gpu_doctor
 
@@ -38,6 +42,33 @@ def doctor_command(args: Namespace) -> int:
         console.print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name:<10}  {finding.found}")
     console.result({"ok": all(f.ok for f in findings), "findings": [asdict(f) for f in findings]})
     return 0 if all(f.ok for f in findings) else 1
+
+
+def _examine_source(uri: str, console: Console) -> int:
+    """Examine a recording; 0 if nothing is wrong with it."""
+    from vtslam.services.sensor.sources.base import live_camera
+    from vtslam.services.sensor.sources.registry import open_source
+    from vtslam.services.sensor_check.examination import FRAMES, burst_starts, examine
+
+    source = open_source(uri)
+    camera = live_camera(source)
+    places = burst_starts(len(source) if camera is None else FRAMES)
+    with ExitStack() as stack:
+        if camera is not None:
+            stack.callback(camera.close)
+        progress = stack.enter_context(Progress(sum(map(len, places)), what="looking", unit="frame"))
+
+        def looked_at(index: int) -> Frame:
+            progress.step()
+            return source.frame(index)
+
+        bursts = ([looked_at(index) for index in place] for place in places)
+        findings = examine(bursts, family=source.family, truth=source.ground_truth())
+    for finding in findings:
+        console.print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name:<15}  {finding.found}")
+    ok = all(finding.ok for finding in findings)
+    console.result({"ok": ok, "source": source.uri, "findings": [asdict(finding) for finding in findings]})
+    return 0 if ok else 1
 
 
 def examine() -> Iterator[Finding]:

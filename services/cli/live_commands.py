@@ -1,6 +1,8 @@
 """``vtslam up`` and ``vtslam publish``: a fleet that waits for frames, and a recording sent to one."""
 
+import sys
 from argparse import Namespace
+from contextlib import ExitStack
 from dataclasses import asdict
 
 from vtslam.common.bus import Bus
@@ -11,6 +13,7 @@ from vtslam.services.cli.run_command import summary_text
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.network import Door, join_from_elsewhere, read_door
 from vtslam.services.sensor.publisher import FramePublisher
+from vtslam.services.sensor.sources.base import LiveCamera, live_camera
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.live_run import run_live
@@ -40,14 +43,26 @@ def up_command(args: Namespace) -> int:
 
 
 def publish_command(args: Namespace) -> int:
-    """Send a recording to a fleet; 0 once all of it is in the map."""
+    """Send a recording to a fleet, or a camera's frames until Ctrl-C; 0 once all of it is in the map."""
     options = {"size": args.size, "range": args.frames}
     source = open_source(args.source, overrides={key: value for key, value in options.items() if value})
-    with Progress(len(source), what="publishing", unit="frame") as progress, FramePublisher(_fleet(args)) as publisher:
+    camera = live_camera(source)
+    total = len(source) if camera is None else None
+    with ExitStack() as stack:
+        if camera is not None:
+            stack.callback(_leave_camera, camera)
+        progress = stack.enter_context(Progress(total, what="publishing", unit="frame"))
+        publisher = stack.enter_context(FramePublisher(_fleet(args)))
         for index in range(len(source)):
             publisher.publish(source.frame(index))
             progress.step()
     return 0
+
+
+def _leave_camera(camera: LiveCamera) -> None:
+    camera.close()
+    lost = ", ".join(f"{name} {count}" for name, count in camera.counters.items())
+    print(f"camera: {lost}", file=sys.stderr)
 
 
 def _door(args: Namespace) -> Door | None:

@@ -96,5 +96,20 @@ def test_refuses_other_lengths_and_nan() -> None:
         trajectory_errors(truth[:0], truth[:0])
     estimated = truth.copy()
     estimated[2, 0, 3] = np.nan
-    with pytest.raises(ValueError, match="finite poses"):
+    with pytest.raises(ValueError, match="finite estimated poses"):
         trajectory_errors(estimated, truth)
+
+
+def test_frames_without_a_true_pose_are_left_out() -> None:
+    truth = random_walk(6)
+    estimated = truth.copy()
+    estimated[:, 0, 3] += [0.01, -0.01, 5.0, 0.02, -0.02, 0.01]
+    partly = truth.copy()
+    partly[2] = np.nan
+    errors = trajectory_errors(estimated, partly)
+    assert np.isnan(errors.position_error_m[2])
+    assert errors.ate_rmse_m < 0.03
+    assert errors.rpe_trans_rmse_m is not None
+    assert errors.rpe_trans_rmse_m < 0.06
+    with pytest.raises(ValueError, match="of which some are finite"):
+        trajectory_errors(estimated, np.full_like(truth, np.nan))

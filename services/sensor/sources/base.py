@@ -1,7 +1,7 @@
 """The protocol of all sources, their errors, and the URI that names one."""
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
@@ -47,8 +47,32 @@ class Source(Protocol):
         ...
 
     def ground_truth(self) -> npt.NDArray[np.float64] | None:
-        """True poses ``T_world_camera`` float64 [F,4,4], or None where the recording has none."""
+        """True poses ``T_world_camera`` float64 [F,4,4], NaN for single frames without, or None if there are none."""
         ...
+
+
+@runtime_checkable
+class LiveCamera(Protocol):
+    """What a source that is a camera offers beside `Source`: its frames are there once, and never end."""
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was lost so far, by kind."""
+        ...
+
+    def close(self) -> None:
+        """Stop the camera."""
+        ...
+
+
+def live_camera(source: Source) -> LiveCamera | None:
+    """The camera that a source takes its frames from; None for recordings."""
+    inner: object = source
+    while not isinstance(inner, LiveCamera):
+        inner = getattr(inner, "inner", None)
+        if inner is None:
+            return None
+    return inner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

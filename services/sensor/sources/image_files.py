@@ -40,6 +40,9 @@ class FilePairSource:
         files: The image files of all frames, in order.
         poses: ``T_world_camera`` float64 [F,4,4], or None.
         no_depth: A raw depth value that means "no depth" besides 0, or None.
+        capture_times_ns: Capture time of each frame; None for 30 frames a second from 0.
+        color_size: Width and height of the colour images where they are not those of ``camera``; they are scaled to it
+            by area.
     """
 
     uri: str
@@ -49,13 +52,15 @@ class FilePairSource:
     files: Sequence[FramePaths]
     poses: npt.NDArray[np.float64] | None
     no_depth: int | None = None
+    capture_times_ns: Sequence[int] | None = None
+    color_size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.files)
 
     def frame(self, index: int) -> Frame:
-        """Frame ``index``, 0 to F-1; capture times are those of 30 frames a second from 0.
+        """Frame ``index``, 0 to F-1.
 
         Raises:
             SourceError: A file is missing, damaged, of another kind, or not of the intrinsics' size.
@@ -66,11 +71,12 @@ class FilePairSource:
         paths = self.files[index]
         rgb, depth = read_color(paths.color), read_depth(paths.depth)
         self._check_sizes(paths, rgb.shape[:2], depth.shape)
+        rgb = scaled_color(rgb, self.camera)
         if self.no_depth is not None:
             depth[depth == self.no_depth] = 0
         return Frame(
             frame_id=index,
-            capture_time_ns=(index * 1_000_000_000) // _FRAMES_PER_SECOND,
+            capture_time_ns=assumed_time_ns(index) if self.capture_times_ns is None else self.capture_times_ns[index],
             rgb=rgb,
             depth=depth,
             depth_scale_m=self.depth_scale_m,
@@ -82,6 +88,9 @@ class FilePairSource:
         return None if self.poses is None else self.poses.copy()
 
     def _check_sizes(self, paths: FramePaths, color_hw: tuple[int, ...], depth_hw: tuple[int, ...]) -> None:
+        if self.color_size is not None:
+            self._check_own_sizes(paths, color_hw, depth_hw, self.color_size)
+            return
         if color_hw != depth_hw:
             raise SourceError(f"{paths.depth}: expected the size of its colour image {_wxh(color_hw)}, "
                               f"found {_wxh(depth_hw)}")  # fmt: skip
@@ -91,6 +100,28 @@ class FilePairSource:
                 f"found {_wxh(color_hw)}"
             )
 
+    def _check_own_sizes(
+        self, paths: FramePaths, color_hw: tuple[int, ...], depth_hw: tuple[int, ...], color_size: tuple[int, int]
+    ) -> None:
+        if color_hw != (color_size[1], color_size[0]):
+            raise SourceError(f"{paths.color}: expected {color_size[0]}x{color_size[1]}, found {_wxh(color_hw)}")
+        if depth_hw != (self.camera.height, self.camera.width):
+            raise SourceError(
+                f"{paths.depth}: expected {self.camera.width}x{self.camera.height}, found {_wxh(depth_hw)}"
+            )
+
+
+def assumed_time_ns(index: int) -> int:
+    """Capture time of frame ``index`` of a recording without time stamps: 30 frames a second from 0."""
+    return (index * 1_000_000_000) // _FRAMES_PER_SECOND
+
+
+def scaled_color(rgb: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
+    """Colour uint8 [h,w,3] at the camera's size, uint8 [H,W,3], by area."""
+    if rgb.shape[:2] == (camera.height, camera.width):
+        return rgb
+    return np.asarray(cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
+
 
 def read_color(path: Path) -> npt.NDArray[np.uint8]:
     """An 8-bit PNG or JPEG file as uint8 [H,W,3], red first; rotation tags are not applied.
@@ -98,17 +129,27 @@ def read_color(path: Path) -> npt.NDArray[np.uint8]:
     Raises:
         SourceError: The file is missing, cut, damaged, or of another kind.
     """
-    data = _read_bytes(path, "colour image")
+    return decoded_color(_read_bytes(path, "colour image"), path)
+
+
+def decoded_color(data: bytes, where: Path | str) -> npt.NDArray[np.uint8]:
+    """What :func:`read_color` gives for a file of these bytes; messages begin with ``where``.
+
+    Raises:
+        SourceError: The bytes are cut, damaged, or of another kind.
+    """
     if data.startswith(_PNG_SIGNATURE):
-        _check_png(path, data)
+        _check_png(where, data)
         if data[24] != 8:
-            raise SourceError(f"{path}: expected an 8-bit colour image, found {data[24]} bits per channel")
+            raise SourceError(f"{where}: expected an 8-bit colour image, found {data[24]} bits per channel")
     elif data.startswith(_JPEG_START):
         if not data.rstrip(b"\0").endswith(_JPEG_END):
-            raise SourceError(f"{path}: expected a whole JPEG file, found it cut after {len(data)} bytes (no end mark)")
+            raise SourceError(
+                f"{where}: expected a whole JPEG file, found it cut after {len(data)} bytes (no end mark)"
+            )
     else:
-        raise SourceError(f"{path}: expected a PNG or JPEG file, found {_head(data)}")
-    bgr = _decode(path, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        raise SourceError(f"{where}: expected a PNG or JPEG file, found {_head(data)}")
+    bgr = _decode(where, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
@@ -148,7 +189,7 @@ def _read_bytes(path: Path, what: str) -> bytes:
         raise SourceError(f"{path}: expected a readable {what}, found {error.strerror}") from error
 
 
-def _check_png(path: Path, data: bytes) -> None:
+def _check_png(path: Path | str, data: bytes) -> None:
     """Walk the chunks (length, type, payload, CRC) from IHDR to IEND."""
     at, kind = len(_PNG_SIGNATURE), b""
     while kind != b"IEND":
@@ -168,7 +209,7 @@ def _check_png(path: Path, data: bytes) -> None:
         at = end
 
 
-def _decode(path: Path, data: bytes, flags: int) -> npt.NDArray[np.generic]:
+def _decode(path: Path | str, data: bytes, flags: int) -> npt.NDArray[np.generic]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:

@@ -88,7 +88,9 @@ def _from_truth(source: Source, sigma: npt.NDArray[np.float64]) -> PriorOf:
     if truth is None:
         raise SourceError(f"{source.uri}: option prior needs true poses, and the recording has none")
 
-    def prior_of(frame: Frame, index: int) -> ExternalPose:
+    def prior_of(frame: Frame, index: int) -> ExternalPose | None:
+        if not np.isfinite(truth[index]).all():
+            return None
         rng = np.random.Generator(np.random.Philox(key=[_NOISE_KEY, index]))
         error = se3.exp(sigma * rng.standard_normal(6))
         T_world_camera = se3.orthonormalized(se3.inverse(error @ se3.inverse(truth[index])))

@@ -32,6 +32,33 @@ def _open_kitti(uri: SourceUri, size: Size | None) -> Source:
     return open_kitti(uri)
 
 
+def _open_tum(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.tum import open_tum
+
+    return open_tum(uri)
+
+
+def _open_scannet(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.scannet import open_scannet
+
+    return open_scannet(uri)
+
+
+def _open_scannetpp(uri: SourceUri, size: Size | None) -> Source:
+    """At half size unless another is asked for, as the paper does."""
+    from vtslam.services.sensor.sources.scannetpp import open_scannetpp
+
+    source = open_scannetpp(uri)
+    half = max(1, source.camera.width // 2), max(1, source.camera.height // 2)
+    return source if size is not None else _resized(source, half)
+
+
+def _open_realsense(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.realsense import open_realsense
+
+    return open_realsense(uri, size)
+
+
 def _open_sim(uri: SourceUri, size: Size | None) -> Source:
     if uri.path == "city":
         from vtslam.services.sensor.sources.sim_city import SimCity
@@ -46,6 +73,10 @@ def _open_sim(uri: SourceUri, size: Size | None) -> Source:
 _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "replica": ("replica:DIR", _open_replica),
     "7scenes": ("7scenes:DIR", _open_seven_scenes),
+    "tum": ("tum:DIR", _open_tum),
+    "scannet": ("scannet:DIR|FILE.sens", _open_scannet),
+    "scannetpp": ("scannetpp:DIR", _open_scannetpp),
+    "realsense": ("realsense:[SERIAL]", _open_realsense),
     "kitti": ("kitti:DIR", _open_kitti),
     "sim": ("sim:room, sim:city", _open_sim),
 }
