@@ -15,6 +15,7 @@ from vtslam.common.frame import Frame
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.process_facts import package_version, program_version
 
+_CAMERA_FRAMES = 144  # that are looked at of a live camera
 _MIN_FREE_MB = 2000.0  # a long run at 640x480 stays below this
 
 
@@ -48,22 +49,22 @@ def _examine_source(uri: str, console: Console) -> int:
     """Examine a recording; 0 if nothing is wrong with it."""
     from vtslam.services.sensor.sources.base import live_camera
     from vtslam.services.sensor.sources.registry import open_source
-    from vtslam.services.sensor_check.examination import FRAMES, burst_starts, examine
+    from vtslam.services.sensor_check.examination import examine, planned_looks
 
     source = open_source(uri)
     camera = live_camera(source)
-    places = burst_starts(len(source) if camera is None else FRAMES)
+    looks = planned_looks(len(source) if camera is None else _CAMERA_FRAMES)
     with ExitStack() as stack:
         if camera is not None:
             stack.callback(camera.close)
-        progress = stack.enter_context(Progress(sum(map(len, places)), what="looking", unit="frame"))
+        progress = stack.enter_context(Progress(len(looks.frames), what="looking", unit="frame"))
 
         def looked_at(index: int) -> Frame:
             progress.step()
             return source.frame(index)
 
-        bursts = ([looked_at(index) for index in place] for place in places)
-        findings = examine(bursts, family=source.family, truth=source.ground_truth())
+        frames = (looked_at(index) for index in looks.frames)
+        findings = examine(frames, looks, family=source.family, truth=source.ground_truth())
     for finding in findings:
         console.print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name:<15}  {finding.found}")
     ok = all(finding.ok for finding in findings)

@@ -1,7 +1,9 @@
 """Gathers what frames of a recording show, and says what is wrong with them."""
 
+from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -23,7 +25,7 @@ from vtslam.services.sensor_check.motion import (
 NEIGHBOURS = 4  # frames before and after the middle one of a burst
 BURST = 2 * NEIGHBOURS + 1
 _BURSTS = 16
-FRAMES = _BURSTS * BURST  # that are looked at, at most
+_FRAMES = 400  # that are looked at, at most
 _REDUCED_WIDTH = 400  # images are reduced by a whole number to at most this
 _BLANK_LEVELS = 3.0  # standard deviation of gray, 0..255
 _BLANK_DEPTH_SHARE = 0.01
@@ -66,52 +68,95 @@ class Evidence:
     unexplained_px: list[tuple[float, float]] = field(default_factory=list)
 
 
-def burst_starts(num_frames: int) -> list[range]:
-    """The successive frames to look at: the first ones, and others spread over the recording; all of a short one."""
-    if num_frames <= BURST:
-        return [range(num_frames)]
-    count = min(_BURSTS, -(-num_frames // BURST))
-    starts = np.linspace(0, num_frames - BURST, count).astype(int)
-    return [range(int(start), int(start) + BURST) for start in starts]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Looks:
+    """Which frames of a recording are looked at.
+
+    Attributes:
+        frames: All of them, in order: the first ones, and others spread over the recording; every one of a short one.
+        ends: Those that end a burst, `BURST` successive frames of `frames` that are looked at thoroughly.
+    """
+
+    frames: list[int]
+    ends: frozenset[int]
+
+
+def planned_looks(num_frames: int) -> Looks:
+    """What to look at of a recording of ``num_frames`` frames, at least one."""
+    length = min(BURST, num_frames)
+    starts = np.linspace(0, num_frames - length, min(_BURSTS, -(-num_frames // BURST))).astype(int)
+    frames = {int(start) + step for start in starts for step in range(length)}
+    if num_frames <= _FRAMES:
+        frames = set(range(num_frames))
+    else:
+        glances = np.linspace(0, num_frames - 2, (_FRAMES - len(frames)) // 2).astype(int)
+        frames.update(int(frame) + step for frame in glances for step in (0, 1))
+    return Looks(frames=sorted(frames), ends=frozenset(int(start) + length - 1 for start in starts))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Seen:
+    """A frame, its reduced images, and whether it shows anything."""
+
+    frame: Frame
+    gray: npt.NDArray[np.uint8]
+    depth_m: npt.NDArray[np.float32]
+    shown: bool
 
 
 def examine(
-    bursts: Iterable[Sequence[Frame]], *, family: str, truth: npt.NDArray[np.float64] | None
+    frames: Iterable[Frame], looks: Looks, *, family: str, truth: npt.NDArray[np.float64] | None
 ) -> list[CheckFinding]:
     """What is wrong with a recording, and what is not.
 
     Args:
-        bursts: Successive frames from several places of it, at least one frame (see `burst_starts`).
+        frames: Those of ``looks.frames``.
+        looks: See `planned_looks`.
         family: Its kind (`vtslam.common.preset_loading.FAMILIES`), for what depths are usual.
         truth: True poses ``T_world_camera`` float64 [F,4,4] by frame id, NaN where not known; None if nowhere.
     """
     evidence: Evidence | None = None
-    for burst in bursts:
+    window: deque[_Seen] = deque(maxlen=BURST)
+    for frame in frames:
         if evidence is None:
-            camera = burst[0].camera
-            evidence = Evidence(camera=camera, reduction=-(-camera.width // _REDUCED_WIDTH))
-        _look_at(burst, evidence, truth)
-    assert evidence is not None, "no burst"
+            evidence = Evidence(camera=frame.camera, reduction=-(-frame.camera.width // _REDUCED_WIDTH))
+        before = window[-1] if window else None
+        window.append(_seen(frame, evidence))
+        if before is not None and before.frame.frame_id + 1 == frame.frame_id and before.shown and window[-1].shown:
+            _look_for_frozen(before.frame, frame, evidence)
+        if frame.frame_id in looks.ends:
+            _look_at_burst(list(window), evidence, truth)
+    assert evidence is not None, "no frame"
     return judged(evidence, family=family)
 
 
-def _look_at(burst: Sequence[Frame], evidence: Evidence, truth: npt.NDArray[np.float64] | None) -> None:
-    grays = [_reduced_gray(frame, evidence.reduction) for frame in burst]
-    depths_m = [_reduced_depth(frame, evidence.reduction) for frame in burst]
-    shown = [_look_at_one(frame, gray, evidence) for frame, gray in zip(burst, grays, strict=True)]
-    for second in range(1, len(burst)):
-        if shown[second - 1] and shown[second]:
-            _look_for_frozen(burst[second - 1], burst[second], evidence)
-            _look_at_motion(burst[second].frame_id, grays[second - 1], grays[second], evidence)
-    middle = len(burst) // 2
-    if all(shown):
-        evidence.edges.add(grays, depths_m, middle)
-    for first, second in ((0, middle), (middle, len(burst) - 1), (0, len(burst) - 1)):
-        if second > first and shown[first] and shown[second]:
-            _look_at_geometry(
-                (burst[first].frame_id, burst[second].frame_id), grays[first], grays[second], depths_m[first], evidence,
-                truth,
-            )  # fmt: skip
+def _look_at_burst(burst: Sequence[_Seen], evidence: Evidence, truth: npt.NDArray[np.float64] | None) -> None:
+    for first, second in pairwise(burst):
+        if first.shown and second.shown:
+            _look_at_motion(second.frame.frame_id, first.gray, second.gray, evidence)
+    middle, last = len(burst) // 2, len(burst) - 1
+    if all(seen.shown for seen in burst):
+        evidence.edges.add([seen.gray for seen in burst], [seen.depth_m for seen in burst], middle)
+    for first_at, second_at in ((0, middle), (middle, last), (0, last)):
+        if second_at > first_at and burst[first_at].shown and burst[second_at].shown:
+            _look_at_geometry(burst[first_at], burst[second_at], evidence, truth)
+
+
+def _seen(frame: Frame, evidence: Evidence) -> _Seen:
+    """Note whether a frame shows anything, and how far away that is."""
+    gray = _reduced_gray(frame, evidence.reduction)
+    evidence.frames += 1
+    known = frame.depth[frame.depth > 0]
+    blank_color = float(gray.std()) < _BLANK_LEVELS
+    blank_depth = known.size < _BLANK_DEPTH_SHARE * frame.depth.size
+    evidence.blank_color += [frame.frame_id] if blank_color else []
+    evidence.blank_depth += [frame.frame_id] if blank_depth else []
+    if not blank_depth:
+        middle, far = np.percentile(known[::7], [50, 95]) * frame.depth_scale_m
+        evidence.depth_middle_m.append(float(middle))
+        evidence.depth_far_m.append(float(far))
+    depth_m = _reduced_depth(frame, evidence.reduction)
+    return _Seen(frame=frame, gray=gray, depth_m=depth_m, shown=not (blank_color or blank_depth))
 
 
 def _reduced_gray(frame: Frame, reduction: int) -> npt.NDArray[np.uint8]:
@@ -125,21 +170,6 @@ def _reduced_depth(frame: Frame, reduction: int) -> npt.NDArray[np.float32]:
     height, width = frame.depth.shape[0] // reduction, frame.depth.shape[1] // reduction
     chosen = frame.depth[reduction // 2 :: reduction, reduction // 2 :: reduction][:height, :width]
     return chosen.astype(np.float32) * np.float32(frame.depth_scale_m)
-
-
-def _look_at_one(frame: Frame, gray: npt.NDArray[np.uint8], evidence: Evidence) -> bool:
-    """Note whether a frame shows anything, and how far away; False if colour or depth do not."""
-    evidence.frames += 1
-    known = frame.depth[frame.depth > 0]
-    blank_color = float(gray.std()) < _BLANK_LEVELS
-    blank_depth = known.size < _BLANK_DEPTH_SHARE * frame.depth.size
-    evidence.blank_color += [frame.frame_id] if blank_color else []
-    evidence.blank_depth += [frame.frame_id] if blank_depth else []
-    if not blank_depth:
-        middle, far = np.percentile(known[::7], [50, 95]) * frame.depth_scale_m
-        evidence.depth_middle_m.append(float(middle))
-        evidence.depth_far_m.append(float(far))
-    return not (blank_color or blank_depth)
 
 
 def _look_for_frozen(first: Frame, second: Frame, evidence: Evidence) -> None:
@@ -160,25 +190,21 @@ def _look_at_motion(
     evidence.followed_share.append((frame_id, tracks.followed_share))
 
 
-def _look_at_geometry(
-    ids: tuple[int, int],
-    first: npt.NDArray[np.uint8],
-    second: npt.NDArray[np.uint8],
-    first_depth_m: npt.NDArray[np.float32],
-    evidence: Evidence,
-    truth: npt.NDArray[np.float64] | None,
-) -> None:
-    first_px, second_px, z_m = with_depth(tracked_corners(first, second), first_depth_m)
-    height, width = first.shape
-    full = evidence.camera
-    whole = (width * evidence.reduction, height * evidence.reduction)
-    camera = Camera(width=whole[0], height=whole[1], fx=full.fx, fy=full.fy, cx=full.cx, cy=full.cy)
-    camera = camera.resized(width, height)
+def _look_at_geometry(first: _Seen, second: _Seen, evidence: Evidence, truth: npt.NDArray[np.float64] | None) -> None:
+    first_px, second_px, z_m = with_depth(tracked_corners(first.gray, second.gray), first.depth_m)
+    camera = _reduced_camera(evidence.camera, evidence.reduction)
     if abs(camera.fx / camera.fy - 1.0) > 0.03:
         found = [unexplained_px(first_px, second_px, z_m, each) for each in (camera, focal_lengths_swapped(camera))]
         if found[0] is not None and found[1] is not None:
             evidence.unexplained_px.append((found[0], found[1]))
+    ids = (first.frame.frame_id, second.frame.frame_id)
     if truth is not None and np.isfinite(truth[list(ids)]).all():
         T_second_first = se3.inverse(truth[ids[1]]) @ truth[ids[0]]
         error = depth_scale_error(first_px, second_px, z_m, camera, T_second_first)
         evidence.scale_errors += [] if error is None else [error]
+
+
+def _reduced_camera(camera: Camera, reduction: int) -> Camera:
+    """The camera of the reduced images, which leave out what is not a whole reduced pixel on the right and below."""
+    width, height = camera.width // reduction, camera.height // reduction
+    return replace(camera, width=width * reduction, height=height * reduction).resized(width, height)
