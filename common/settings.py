@@ -26,12 +26,16 @@ class SourceSettings:
         frames: "A:B", the part of the recording.
         noise: Depth and colour noise of a simulated source.
         seed: Seed of a simulated source.
+        poses: Poses from elsewhere, as priors: a trajectory file (TUM), or a topic of transforms in the recording.
+        poses_sigma: "M,DEG", their standard deviations per axis.
     """
 
     size: str = ""
     frames: str = ""
     noise: Literal["", "none", "kinect", "stereo"] = ""
     seed: Annotated[int, Range(-1, 2**31)] = -1
+    poses: str = ""
+    poses_sigma: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,6 +160,7 @@ class TrackerSettings:
     """Pose of a frame (paper, section 3.3).
 
     Attributes:
+        enabled: Whether frames are tracked that come with a pose; otherwise they are mapped there.
         optimizer: Which one.
         visibility: Mask heads by what the overlapping section's first, middle and last frame saw.
         visibility_tolerance: Relative depth difference up to which a pixel counts as seen.
@@ -166,6 +171,7 @@ class TrackerSettings:
         lost_loss_factor: Final loss over the usual loss, above which it is called lost.
     """
 
+    enabled: bool = True
     optimizer: Literal["adam", "gauss_newton"] = "adam"
     visibility: bool = True
     visibility_tolerance: Annotated[float, Range(0.0, 1.0, low_open=True)] = 0.01
@@ -302,13 +308,28 @@ class StorageSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecorderSettings:
+    """The recording of a run, in an MCAP file beside what the run itself leaves.
+
+    Attributes:
+        file: The file to make; empty for none.
+        color: Colour without loss (png), or several times smaller (jpeg). Depth is always without loss.
+        jpeg_quality: Of such colour.
+    """
+
+    file: str = ""
+    color: Literal["png", "jpeg"] = "png"
+    jpeg_quality: Annotated[int, Range(1, 100)] = 95
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """All settings of a run.
 
     Attributes:
         seed: Key of every random choice.
         holdout: Every so many regular frames one is tracked but kept out of mapping; 0 none.
-        source, splat, section, tracker, mapper, storage, fleet: The parts.
+        source, splat, section, tracker, mapper, storage, fleet, recorder: The parts.
     """
 
     seed: Annotated[int, Range(0, 2**31)] = 2
@@ -320,3 +341,4 @@ class Settings:
     mapper: MapperSettings = field(default_factory=MapperSettings)
     storage: StorageSettings = field(default_factory=StorageSettings)
     fleet: FleetSettings = field(default_factory=FleetSettings)
+    recorder: RecorderSettings = field(default_factory=RecorderSettings)

@@ -8,7 +8,10 @@ import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
 
-FIRST_FRAME_STATE, KNOWN_STATE = "first", "known"  # not tracked: defines the world; came with its pose
+
+def untracked_state(*, is_first: bool) -> str:
+    """The state of a frame that was not tracked: it defines the world, or came with its pose."""
+    return "first" if is_first else "known"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +14,11 @@ from vtslam.common.splat.engine import Engine
 from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.engines import thread_count
 from vtslam.services.frame_facts import (
-    FIRST_FRAME_STATE,
-    KNOWN_STATE,
     CommittedFrame,
     FrameFacts,
     Seconds,
     frame_facts,
+    untracked_state,
 )
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.resume import ResumePoint
@@ -30,6 +30,9 @@ from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
 from vtslam.storage.section_record import SectionRecord
 
+if TYPE_CHECKING:
+    from vtslam.storage.recording.writer import RecordingWriter
+
 
 def run_recording(
     source: Source,
@@ -39,6 +42,7 @@ def run_recording(
     *,
     resume: ResumePoint | None = None,
     known_poses: npt.NDArray[np.float64] | None = None,
+    recording: "RecordingWriter | None" = None,
     on_frame: Callable[[FrameFacts], None] = lambda facts: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> RunSummary:
@@ -51,6 +55,7 @@ def run_recording(
         run: A run folder, open for writing; empty unless ``resume`` is given.
         resume: Where to go on; from the beginning if None.
         known_poses: ``T_world_camera`` float64 [F,4,4] of all frames, to map at them without tracking.
+        recording: Where frames and poses are recorded, or None.
         on_frame: Called after each frame.
         should_stop: Asked before each frame; True ends the run, and what was done is kept.
 
@@ -58,7 +63,7 @@ def run_recording(
         SourceError: A frame cannot be read; what was done before it is kept.
         StorageError: Something cannot be written.
     """
-    recorder = _Recorder(settings, engine, run, resume)
+    recorder = _Recorder(settings, engine, run, resume, recording)
     interrupted = False
     try:
         for index in range(0 if resume is None else resume.facts.num_frames, len(source)):
@@ -86,8 +91,16 @@ class _RecentArchive(SectionArchive):
 class _Recorder:
     """The system, its run folder and the frames of the open section."""
 
-    def __init__(self, settings: Settings, engine: Engine, run: RunFolder, resume: ResumePoint | None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        engine: Engine,
+        run: RunFolder,
+        resume: ResumePoint | None,
+        recording: "RecordingWriter | None",
+    ) -> None:
         self._start_s = time.perf_counter()
+        self._recording = recording
         self._archive = _RecentArchive(run)
         self._system = System(
             settings, engine, self._archive, threads=thread_count(settings.splat), clock=time.perf_counter
@@ -104,12 +117,16 @@ class _Recorder:
         start_s = time.perf_counter()
         frame = source.frame(index)
         read_s = time.perf_counter() - start_s
+        if self._recording is not None:
+            self._recording.add_frame(frame)
         report = self._system.process(frame, known_T_world_camera=known_T_world_camera)
         facts = _facts_of(report, read_s=read_s, total_s=time.perf_counter() - start_s)
         T_world_camera = report.commit.T_world_camera
         self._record.add(
             CommittedFrame(facts=facts, capture_time_ns=frame.capture_time_ns, T_world_camera=T_world_camera)
         )
+        if self._recording is not None:
+            self._recording.add_pose(frame.frame_id, frame.capture_time_ns, report.commit.T_world_camera)
         self._report = report
         if report.sealed is not None:
             self._commit()
@@ -155,7 +172,7 @@ class _Recorder:
 def _state(report: FrameReport) -> str:
     if report.tracking is not None:
         return report.tracking.state.value
-    return FIRST_FRAME_STATE if report.commit.frame_id == 0 else KNOWN_STATE
+    return untracked_state(is_first=report.commit.frame_id == 0)
 
 
 def _facts_of(report: FrameReport, *, read_s: float, total_s: float) -> FrameFacts:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.common.config import load, to_dict
+from vtslam.common.config import ConfigError, load, to_dict
 from vtslam.common.preset_loading import load_settings
 from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
@@ -16,6 +16,7 @@ from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import program_version, versions
+from vtslam.services.recorder.files import make_way, maybe_recording
 from vtslam.services.recording_run import run_recording
 from vtslam.services.resume import ResumePoint, prepare_to_resume
 from vtslam.services.run_record import RunRecord, RunSummary
@@ -63,7 +64,7 @@ class RunPlan:
 
         Args:
             folder: Where the run folder is made.
-            overwrite: Give up an earlier run there.
+            overwrite: Give up an earlier run there, and an earlier recording.
             created_by: Program and version for ``run.toml``; this program if None.
             known_poses: ``T_world_camera`` float64 [F,4,4] of all frames, to map at them without tracking.
             on_frame: Called after each frame.
@@ -73,13 +74,18 @@ class RunPlan:
             StorageError: The folder cannot be made or written.
             SourceError: A frame cannot be read; what was done before it is kept.
         """
-        with RunFolder.create(folder, self._info(created_by), overwrite=overwrite) as run:
+        make_way(self.settings.recorder, overwrite=overwrite)
+        with (
+            RunFolder.create(folder, self._info(created_by), overwrite=overwrite) as run,
+            maybe_recording(self.settings.recorder, family=self.family) as recording,
+        ):
             return run_recording(
                 self.source,
                 self.settings,
                 self.engine,
                 run,
                 known_poses=known_poses,
+                recording=recording,
                 on_frame=on_frame,
                 should_stop=should_stop,
             )
@@ -101,9 +107,17 @@ class RunPlan:
             point = self._prepared(run)
             if self._is_complete(point):
                 return _closed(run)
-            return run_recording(
-                self.source, self.settings, self.engine, run, resume=point, on_frame=on_frame, should_stop=should_stop
-            )
+            with maybe_recording(self.settings.recorder, family=self.family) as recording:
+                return run_recording(
+                    self.source,
+                    self.settings,
+                    self.engine,
+                    run,
+                    resume=point,
+                    recording=recording,
+                    on_frame=on_frame,
+                    should_stop=should_stop,
+                )
 
     def resume_in_fleet(self, folder: Path, hooks: "FleetHooks") -> RunSummary:
         """As :meth:`resume`, each service a process of its own; raises as `execute_in_fleet`."""
@@ -132,6 +146,7 @@ class RunPlan:
         """
         from vtslam.services.supervisor.fleet_run import run_in_fleet
 
+        make_way(self.settings.recorder, overwrite=overwrite)
         with RunFolder.create(folder, self._info(None), overwrite=overwrite) as run:
             return run_in_fleet(run, self.settings, hooks)
 
@@ -181,6 +196,8 @@ def plan_run(
         )
     family = family or source.family
     settings = load_settings(preset=preset, family=family, file=config, assignments=assignments)
+    if not settings.tracker.enabled and source.frame(0).pose_prior is None:
+        raise ConfigError(f"--tracking off: {source.uri}: expected a pose for the first frame (--poses), found none")
     return RunPlan(source=source, settings=settings, engine=make_engine(settings.splat), preset=preset, family=family)
 
 
@@ -217,7 +234,13 @@ def _closed(run: RunFolder) -> RunSummary:
 
 def _source_options(settings: SourceSettings) -> dict[str, str]:
     """The options of a source's URI that the settings ask for."""
-    options = {"size": settings.size, "range": settings.frames, "noise": settings.noise}
+    options = {
+        "size": settings.size,
+        "range": settings.frames,
+        "noise": settings.noise,
+        "poses": settings.poses,
+        "poses_sigma": settings.poses_sigma,
+    }
     if settings.seed >= 0:
         options["seed"] = str(settings.seed)
     return {key: value for key, value in options.items() if value}

@@ -16,7 +16,7 @@ from vtslam.services.mapper.turns import MapperTurns
 from vtslam.services.section_map import ReadsSections, SectionMap
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.masks import mean_depth_m
-from vtslam.services.tracker.state import TrackerState, TrackResult, first_pose
+from vtslam.services.tracker.state import TrackerState, TrackResult, untracked_pose
 
 
 class Archive(ReadsSections, Protocol):
@@ -110,14 +110,14 @@ class System:
         """
         section_id, row = divmod(self._frames, self.settings.section.length)
         tracking, start_s, budget_s = None, self._clock(), self.settings.mapper.budget_s
-        if self._frames > 0 and known_T_world_camera is None:
+        if known_T_world_camera is None and self._tracker.tracks(frame, is_first=self._frames == 0):
             tracking = self._tracker.track(
                 frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
             )
         if known_T_world_camera is not None:
             T_world_camera = known_T_world_camera
         else:
-            T_world_camera = first_pose(frame) if tracking is None else tracking.T_world_camera
+            T_world_camera = untracked_pose(frame) if tracking is None else tracking.T_world_camera
         tracked_s = self._clock()
         self.active, commit = self._mapper.map(
             frame,

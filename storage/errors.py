@@ -49,6 +49,10 @@ class CatalogError(StorageError):
     """The catalogue of a run cannot be read or written, or does not hold what it should."""
 
 
+class MalformedRecording(StorageError):
+    """A recording breaks its format, or lacks what is needed."""
+
+
 class RunFolderError(StorageError):
     """A run folder cannot be made, opened or understood."""
 

@@ -11,6 +11,12 @@ settings.register_profile("steady", deadline=None, derandomize=True, database=No
 settings.load_profile("steady")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """How much of what takes long is tried."""
+    parser.addoption("--recorder-kills", type=int, default=4, help="times that a recorder is killed")
+    parser.addoption("--bag-frames", type=int, default=4, help="frames of a real recording that are played as a bag")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _nothing_is_left() -> Iterator[None]:
     """No process, socket or shared memory of a fleet outlives the tests."""

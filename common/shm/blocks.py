@@ -30,6 +30,7 @@ MAX_KEPT = _HISTORY // 2  # the word of the next number must not be that of a ke
 _W_MAGIC, _W_VERSION, _W_KIND, _W_FILE_BYTES, _W_WRITER, _W_STATE, W_COUNTER_A, W_COUNTER_B, _W_PINS, _W_DESCRIPTION = (
     range(10)
 )
+W_COUNTER_C = 10
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM)
 
 

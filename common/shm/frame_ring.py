@@ -15,6 +15,7 @@ from vtslam.common.shm._atomics import fence
 from vtslam.common.shm.blocks import (
     W_COUNTER_A,
     W_COUNTER_B,
+    W_COUNTER_C,
     ControlPage,
     Kind,
     State,
@@ -27,7 +28,7 @@ from vtslam.common.shm.pins import Pin
 from vtslam.common.shm.process_identity import own_identity
 from vtslam.common.shm.ring_layout import DESCRIPTION, FrameDescriptor, RingArea, RingSpec
 
-_W_ACKNOWLEDGED, _W_LOST = W_COUNTER_A, W_COUNTER_B
+_W_ACKNOWLEDGED, _W_LOST, _W_RECORDED = W_COUNTER_A, W_COUNTER_B, W_COUNTER_C
 _POLL_S = 0.0005
 
 
@@ -66,21 +67,39 @@ class _Ring:
         """Frames that were overwritten before they were acknowledged."""
         return self._control.words.load(_W_LOST)
 
+    @property
+    def recorded(self) -> int | None:
+        """All frames up to this sequence number are recorded; None if lockstep does not wait for a recorder."""
+        word = self._control.words.load(_W_RECORDED)
+        return word - 1 if word else None
+
     def acknowledge(self, sequence: int) -> None:
         """Say that all frames up to ``sequence`` are done with; an older number changes nothing.
 
         Raises:
             ValueError: No such frame was published.
         """
+        self._raise_word(_W_ACKNOWLEDGED, sequence, sequence)
+
+    def record(self, sequence: int) -> None:
+        """Say that all frames up to ``sequence`` are recorded, if anybody waits for that; raises as `acknowledge`."""
+        if self.recorded is not None:
+            self._raise_word(_W_RECORDED, sequence, sequence + 1)
+
+    def _raise_word(self, word: int, sequence: int, value: int) -> None:
         if sequence > self.published:
             raise ValueError(f"{self.path}: frame {sequence} was never published, the newest is {self.published}")
-        while (former := self.acknowledged) < sequence:
-            if self._control.words.compare_exchange(_W_ACKNOWLEDGED, former, sequence):
+        while (former := self._control.words.load(word)) < value:
+            if self._control.words.compare_exchange(word, former, value):
                 return
 
     def unacknowledged(self) -> list[FrameDescriptor]:
         """Frames that are in the ring and not done with, oldest first."""
-        low, high = self.acknowledged, self.published
+        return self.after(self.acknowledged)
+
+    def after(self, sequence: int) -> list[FrameDescriptor]:
+        """Frames that are in the ring and newer than ``sequence``, oldest first."""
+        low, high = sequence, self.published
         states = ((self._area.slot_state(slot), slot) for slot in range(self.spec.slots))
         return [
             FrameDescriptor(slot=slot, sequence=state >> 1)
@@ -97,13 +116,16 @@ class FrameRingWriter(_Ring):
         self._state = state or self._control.state
 
     @classmethod
-    def create(cls, path: Path, spec: RingSpec, *, acknowledged: int = 0) -> "FrameRingWriter":
+    def create(
+        cls, path: Path, spec: RingSpec, *, acknowledged: int = 0, is_recorded: bool = False
+    ) -> "FrameRingWriter":
         """Make a ring with all its memory reserved.
 
         Args:
             path: Where.
             spec: Its size.
             acknowledged: Frames before its first one, which are done with.
+            is_recorded: In lockstep, frames stay until :meth:`record` was said of them.
 
         Raises:
             SharedMemoryFull: There is not enough.
@@ -122,6 +144,7 @@ class FrameRingWriter(_Ring):
             if acknowledged:
                 control.publish(control.state, State(epoch=1, number=acknowledged, buffer=0))
                 control.words.store(_W_ACKNOWLEDGED, acknowledged)
+            control.words.store(_W_RECORDED, acknowledged + 1 if is_recorded else 0)
             new.rename(path)
         except BaseException:
             new.unlink(missing_ok=True)
@@ -149,7 +172,9 @@ class FrameRingWriter(_Ring):
         return ring
 
     def try_publish(self, frame: Frame, *, credit: int) -> FrameDescriptor | None:
-        """Publish unless ``credit`` frames are unacknowledged; None then, and nothing has changed.
+        """Publish unless ``credit`` frames are unacknowledged, or all slots hold frames that are not recorded.
+
+        None then, and nothing has changed.
 
         Raises:
             ValueError: The frame has another size than the ring, or slots cannot hold pins and credit.
@@ -160,7 +185,9 @@ class FrameRingWriter(_Ring):
         acknowledged = self.acknowledged
         if self._state.number - acknowledged >= credit:
             return None
-        return self._published(frame, oldest_kept=acknowledged + 1)
+        recorded = self.recorded
+        done = acknowledged if recorded is None else min(acknowledged, recorded)
+        return self._published(frame, oldest_kept=done + 1)
 
     def publish_waiting(self, frame: Frame, *, credit: int, timeout_s: float) -> FrameDescriptor:
         """Publish without overwriting what was not acknowledged, as lockstep does; waits for it.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 SOURCE_HELP = (
     "where frames come from: replica:DIR, 7scenes:DIR, tum:DIR, scannet:DIR|FILE.sens, scannetpp:DIR, "
-    "realsense:, kitti:DIR, sim:room, sim:city"
+    "realsense:, kitti:DIR, mcap:FILE, sim:room, sim:city"
 )
 _JSON_HELP = "write the result as JSON (- for standard output)"
 
@@ -23,6 +23,7 @@ def parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_up(commands)
     _add_publish(commands)
+    _add_record(commands)
     _add_status(commands)
     _add_eval(commands)
     _add_sections(commands)
@@ -81,6 +82,8 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         help="go on with a run that was cut off or stopped, with its own source and settings",
     )
     _add_pacing(command, default="lockstep")
+    _add_recording(command)
+    _add_poses(command)
     _add_layers(command)
     _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
@@ -97,6 +100,7 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_pacing(command, default="realtime")
+    _add_recording(command)
     command.add_argument("--listen", metavar="HOST:PORT", help="let other hosts in here; needs --access")
     command.add_argument("--access", type=Path, metavar="FILE", help="who may come in (TOML, see deploy/runbook.md)")
     _add_layers(command)
@@ -116,6 +120,20 @@ def _add_publish(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--credentials", type=Path, metavar="FILE", help="login or certificate (TOML)")
     command.add_argument("--size", metavar="WxH", help="scale frames to this size")
     command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+
+
+def _add_record(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "record",
+        "record what a running fleet sees and finds, until it ends or Ctrl-C",
+        example="vtslam record --fleet kitchen --out kitchen.mcap",
+    )
+    command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="MCAP file to make")
+    command.add_argument("--overwrite", action="store_true", help="give up an earlier recording")
+    command.add_argument("--color", choices=["png", "jpeg"], default="png", help="png keeps every bit (default)")
+    command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
 
 def _add_status(commands: "_Commands[argparse.ArgumentParser]") -> None:
@@ -244,6 +262,26 @@ def _add_source_shorthands(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", metavar="A:B", help="frames A to B-1 only (source.frames)")
     command.add_argument(
         "--holdout", type=int, metavar="K", help="track every K-th regular frame but keep it out of mapping (holdout)"
+    )
+
+
+def _add_poses(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--poses",
+        metavar="FILE|TOPIC",
+        help="poses from elsewhere: a trajectory (TUM), or transforms in the recording, as in /tf (source.poses)",
+    )
+    command.add_argument(
+        "--poses-sigma", metavar="M,DEG", help="their standard deviations (source.poses_sigma; default: 0.05,1)"
+    )
+    command.add_argument(
+        "--tracking", choices=["on", "off"], help="off: such poses are taken as they are (tracker.enabled)"
+    )
+
+
+def _add_recording(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--record", metavar="FILE", help="record frames, poses and events in this MCAP file (recorder.file)"
     )
 
 

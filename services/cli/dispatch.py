@@ -53,6 +53,10 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.live_commands import publish_command
 
             return publish_command(args)
+        case "record":
+            from vtslam.services.cli.record_command import record_command
+
+            return record_command(args)
         case "status":
             from vtslam.services.cli.status_command import status_command
 

@@ -1,5 +1,6 @@
 """``vtslam up`` and ``vtslam publish``: a fleet that waits for frames, and a recording sent to one."""
 
+import json
 import sys
 from argparse import Namespace
 from contextlib import ExitStack
@@ -9,7 +10,7 @@ from vtslam.common.bus import Bus
 from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
-from vtslam.services.cli.run_command import summary_text
+from vtslam.services.cli.run_command import recording_of, summary_text
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.network import Door, join_from_elsewhere, read_door
 from vtslam.services.sensor.publisher import FramePublisher
@@ -33,7 +34,7 @@ def up_command(args: Namespace) -> int:
             preset=args.preset,
             family=args.family or "tum",
             config=args.config,
-            assignments=args.assignments,
+            assignments=[*args.assignments, *(f"{key}={json.dumps(v)}" for key, v in recording_of(args).items())],
             overwrite=args.overwrite,
             door=door,
         )

@@ -1,6 +1,7 @@
 """``vtslam run``: track and map a recording."""
 
 import json
+import os
 from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
@@ -91,6 +92,23 @@ def watched_fleet(plan: RunPlan, out: Path, stop: StopRequest, *, overwrite: boo
         return plan.execute_in_fleet(out, hooks, overwrite=overwrite)
 
 
+def recording_of(args: Namespace) -> dict[str, str]:
+    """The settings that ``--record`` stands for, if it was given."""
+    file: str | None = getattr(args, "record", None)  # not every command that shares the others has it
+    return {} if file is None else {"recorder.file": os.path.abspath(file)}
+
+
+def _poses_of(args: Namespace) -> dict[str, str | bool | float]:
+    """The settings that ``--poses``, ``--poses-sigma`` and ``--tracking`` stand for, as far as they were given."""
+    shorthands = {"source.poses": "poses", "source.poses_sigma": "poses_sigma"}
+    given = {key: getattr(args, name, None) for key, name in shorthands.items()}
+    settings: dict[str, str | bool | float] = {key: value for key, value in given.items() if value is not None}
+    if getattr(args, "tracking", None) == "off":  # such poses are not refined either
+        settings |= {"tracker.enabled": False}
+        settings |= {"mapper.bundle_rotation_rate": 0.0, "mapper.bundle_translation_rate": 0.0}
+    return settings
+
+
 def summary_text(summary: RunSummary) -> str:
     """The end of a run in words."""
     rate = summary.frames / summary.seconds if summary.seconds > 0 else 0.0
@@ -109,5 +127,6 @@ def assignments_of(args: Namespace) -> list[str]:
     """``--set`` texts, and those that the short options stand for."""
     shorthands = {"source.size": args.size, "source.frames": args.frames, "holdout": args.holdout}
     given = {key: value for key, value in shorthands.items() if value is not None}
+    given |= recording_of(args) | _poses_of(args)
     # JSON's quotes are TOML's: a size of 48 stays a text, which the source then explains.
     return [*args.assignments, *(f"{key}={json.dumps(value)}" for key, value in given.items())]

@@ -19,7 +19,7 @@ from vtslam.common.shm.sealed_block import sealed_bytes
 from vtslam.common.splat.engine import Engine
 from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED
 from vtslam.services.commit_facts import CommitFacts, pixels_crc32
-from vtslam.services.frame_facts import FIRST_FRAME_STATE, CommittedFrame, Seconds, frame_facts
+from vtslam.services.frame_facts import CommittedFrame, Seconds, frame_facts, untracked_state
 from vtslam.services.frame_journal import JournalWriter
 from vtslam.services.mapper.pose_intake import EveryPose, NewestPose, PoseIntake
 from vtslam.services.mapper.state import ActiveSection, CommitRecord
@@ -199,7 +199,7 @@ class MapperService:
             record,
             pose.quality,
             pose.covariance,
-            state=FIRST_FRAME_STATE if pose.quality is None else pose.state.value,
+            state=pose.state.value if pose.quality is not None else untracked_state(is_first=self._num_frames == 0),
             seconds=Seconds(read_s=pose.read_s, track_s=pose.track_s, map_s=map_s, total_s=total_s),
         )
         return CommitFacts(

@@ -30,10 +30,14 @@ class LiveSensor:
         link: What it says of itself and is told.
         ring_path: Where the ring is, or will be once the first frame came.
         credit: Frames that may be in the ring without being committed; None in realtime, where the oldest one goes.
+        is_recorded: Whether frames stay in the ring until they are recorded, but for realtime.
     """
 
-    def __init__(self, bus: Bus, link: ServiceLink, ring_path: Path, *, credit: int | None = 2) -> None:
+    def __init__(
+        self, bus: Bus, link: ServiceLink, ring_path: Path, *, credit: int | None = 2, is_recorded: bool = False
+    ) -> None:
         self._clock, self._link, self._ring_path, self._credit_frames = bus.clock, link, ring_path, credit
+        self._is_recorded = is_recorded
         self._pixels = bus.subscriber(SENSOR_PIXELS)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
         self._frames = bus.publisher(SENSOR_FRAME)
@@ -77,7 +81,9 @@ class LiveSensor:
             return True
         frame, condition = self._in_time(_frame_of(pixels))
         if self._ring is None:
-            self._ring = make_ring(self._ring_path, frame.camera, credit=self._credit_frames)
+            self._ring = make_ring(
+                self._ring_path, frame.camera, credit=self._credit_frames, is_recorded=self._is_recorded
+            )
         descriptor = self._published(self._ring, frame)
         if descriptor is None:
             return False

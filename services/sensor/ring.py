@@ -13,7 +13,9 @@ _PINS = 4
 _REALTIME_SLOTS = 8  # of them two or three are pinned; the rest is what readers may be late
 
 
-def make_ring(path: Path, camera: Camera, *, credit: int | None = None, frames_before: int = 0) -> FrameRingWriter:
+def make_ring(
+    path: Path, camera: Camera, *, credit: int | None = None, frames_before: int = 0, is_recorded: bool = False
+) -> FrameRingWriter:
     """A new ring for frames of ``camera``; raises SharedMemoryFull.
 
     Args:
@@ -21,10 +23,12 @@ def make_ring(path: Path, camera: Camera, *, credit: int | None = None, frames_b
         camera: Of all frames.
         credit: Frames that may be in it without being committed; None in realtime, where any may be overwritten.
         frames_before: Frames before the first one, which are done with.
+        is_recorded: Whether frames stay until they are recorded, unless any may be overwritten.
     """
     slots = _REALTIME_SLOTS if credit is None else _PINS + credit
     spec = RingSpec(width=camera.width, height=camera.height, slots=slots, pins=_PINS)
-    return FrameRingWriter.create(path, spec, acknowledged=frames_before)
+    waits = is_recorded and credit is not None
+    return FrameRingWriter.create(path, spec, acknowledged=frames_before, is_recorded=waits)
 
 
 def descriptor_message(

@@ -24,6 +24,7 @@ class RecordingSensor:
         ring_path: Where the ring is, or will be.
         credit: Frames that may be in the ring without being committed.
         frames_before: Frames that an earlier part of the run has mapped.
+        is_recorded: Whether frames stay in the ring until they are recorded.
     """
 
     def __init__(
@@ -35,11 +36,12 @@ class RecordingSensor:
         *,
         credit: int = 2,
         frames_before: int = 0,
+        is_recorded: bool = False,
     ) -> None:
         self._link, self._source, self._credit = link, source, credit
         self._frames = bus.publisher(SENSOR_FRAME)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
-        self._ring = _open_ring(ring_path, source, credit, frames_before)
+        self._ring = _open_ring(ring_path, source, credit, frames_before, is_recorded)
         self._next = self._ring.published  # frames are numbered from 0, the ring's sequence from 1
         self._read: tuple[Frame, float] | None = None
         self._announce_again(FrameRingReader(ring_path))
@@ -73,11 +75,11 @@ class RecordingSensor:
         self._frames.publish(descriptor_message(frame, descriptor, epoch=self._link.epoch, read_s=read_s))
 
 
-def _open_ring(path: Path, source: Source, credit: int, frames_before: int) -> FrameRingWriter:
+def _open_ring(path: Path, source: Source, credit: int, frames_before: int, is_recorded: bool) -> FrameRingWriter:
     """The fleet's ring, taken over from a sensor that died if there was one."""
     if path.exists():
         return FrameRingWriter.adopt(path)
-    return make_ring(path, source.camera, credit=credit, frames_before=frames_before)
+    return make_ring(path, source.camera, credit=credit, frames_before=frames_before, is_recorded=is_recorded)
 
 
 def timed(source: Source, index: int) -> tuple[Frame, float]:

@@ -111,13 +111,17 @@ def _sensor(parts: _Parts) -> "Steps":
     from vtslam.services.sensor.sources.registry import open_source
 
     bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
+    is_recorded = bool(parts.settings.recorder.file)
     if parts.is_live:
-        return LiveSensor(bus, link, ring_path, credit=None if pace.is_realtime else pace.credit)
+        credit = None if pace.is_realtime else pace.credit
+        return LiveSensor(bus, link, ring_path, credit=credit, is_recorded=is_recorded)
     source = open_source(parts.source)
     if pace.is_realtime:
         return ReplaySensor(bus, link, source, ring_path, rate_hz=pace.replay_hz)
     durable = parts.run.catalog.num_frames  # when the sensor starts for the first time, these are all
-    return RecordingSensor(bus, link, source, ring_path, credit=pace.credit, frames_before=durable)
+    return RecordingSensor(
+        bus, link, source, ring_path, credit=pace.credit, frames_before=durable, is_recorded=is_recorded
+    )
 
 
 def _tracker(parts: _Parts) -> "Steps":
@@ -163,7 +167,21 @@ def _mapper(parts: _Parts) -> "Steps":
     )
 
 
-_BUILDERS: dict[str, Callable[[_Parts], "Steps"]] = {"sensor": _sensor, "tracker": _tracker, "mapper": _mapper}
+def _recorder(parts: _Parts) -> "Steps":
+    from vtslam.services.recorder.files import open_recording
+    from vtslam.services.recorder.service import RecorderService
+
+    family = parts.run.read_info().facts.family
+    recording = open_recording(parts.settings.recorder, family=family)
+    return RecorderService(parts.bus, parts.link, parts.folder, recording)
+
+
+_BUILDERS: dict[str, Callable[[_Parts], "Steps"]] = {
+    "sensor": _sensor,
+    "tracker": _tracker,
+    "mapper": _mapper,
+    "recorder": _recorder,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

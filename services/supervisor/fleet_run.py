@@ -22,7 +22,7 @@ from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
-from vtslam.services.supervisor.processes import LIVE_SOURCE, PROCESSES
+from vtslam.services.supervisor.processes import LIVE_SOURCE, processes_of
 from vtslam.services.supervisor.recorder import Recorder
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
@@ -83,7 +83,8 @@ def run_in_fleet(
     fleet = fleet or f"run-{os.getpid()}-{secrets.token_hex(3)}"
     folder = FleetFolder.create(fleet, run_folder=str(run.path.resolve()), base=base)
     try:
-        for process in PROCESSES:
+        processes = processes_of(settings)
+        for process in processes:
             folder.reserve_failure(process.name)
         store, metrics = map_store(folder, settings), FleetMetrics()
 
@@ -105,6 +106,7 @@ def run_in_fleet(
                 bus,
                 fleet=fleet,
                 folder=folder,
+                processes=processes,
                 recorder=recorder,
                 hang_s=settings.fleet.hang_s,
                 pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,

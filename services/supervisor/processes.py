@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
 
 
@@ -12,7 +13,7 @@ class Process:
     Attributes:
         name: Its name, for status and orders.
         role: What it may publish.
-        after: Processes that are ready before it is started.
+        after: Processes that are ready before it is started, as far as the fleet has them.
     """
 
     name: str
@@ -20,15 +21,21 @@ class Process:
     after: tuple[str, ...] = ()
 
 
-SENSOR = Process(name="sensor", role=Role.SENSOR, after=("mapper", "tracker"))
+SENSOR = Process(name="sensor", role=Role.SENSOR, after=("mapper", "tracker", "recorder"))
 TRACKER = Process(name="tracker", role=Role.TRACKER)
 MAPPER = Process(name="mapper", role=Role.MAPPER)
+RECORDER = Process(name="recorder", role=Role.RECORDER)
 
 LIVE_SOURCE = "live:"  # in run.toml: frames come from publishers
 
-PROCESSES = (MAPPER, TRACKER, SENSOR)
+PROCESSES = (MAPPER, TRACKER, SENSOR)  # of every fleet
+
+
+def processes_of(settings: Settings) -> tuple[Process, ...]:
+    """The processes of a fleet with these settings."""
+    return (*PROCESSES, RECORDER) if settings.recorder.file else PROCESSES
 
 
 def process_named(name: str) -> Process:
     """The process of a name; KeyError if there is none."""
-    return {process.name: process for process in PROCESSES}[name]
+    return {process.name: process for process in (*PROCESSES, RECORDER)}[name]

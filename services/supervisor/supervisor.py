@@ -1,6 +1,6 @@
 """The supervisor: starts the processes of a fleet in order, watches them, starts them again, stops them in order."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 
 from vtslam.common.bus import Bus
@@ -13,7 +13,7 @@ from vtslam.services.pacing import Pacing
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import ProcessRefused
-from vtslam.services.supervisor.processes import MAPPER, PROCESSES, SENSOR, TRACKER
+from vtslam.services.supervisor.processes import MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, Process
 from vtslam.services.supervisor.recorder import Recorder
 
 _POLL_S = 0.1  # between looks at the processes, when the bus is silent
@@ -27,6 +27,7 @@ class _Phase(Enum):
     RUNNING = "running"
     FINISHING = "finishing the rest"  # the sensor has ended
     LAST_ENDING = "ending"  # and so has the second of the other two
+    RECORDING = "recording the rest"  # all have but the recorder, if there is one
     ENDED = "ended"
 
 
@@ -39,6 +40,7 @@ class Supervisor:
         folder: The fleet's folder.
         recorder: Writes the run folder.
         hang_s: Silence of a work loop that is a hang.
+        processes: The processes of the fleet.
         pacing: Who waits for whom; decides who ends after whom.
         on_event: Told, in words, of what the user should know.
         environment: Variables for a process, for tests and experiments.
@@ -55,6 +57,7 @@ class Supervisor:
         folder: FleetFolder,
         recorder: Recorder,
         hang_s: float,
+        processes: Sequence[Process] = PROCESSES,
         pacing: Pacing = Pacing.LOCKSTEP,
         on_event: Callable[[str], None] = lambda text: None,
         environment: Environment = lambda name, epoch: {},
@@ -62,7 +65,7 @@ class Supervisor:
         self._bus, self._folder, self._recorder, self._pacing = bus, folder, recorder, pacing
         self._on_event, self._environment = on_event, environment
         self._children = {
-            process.name: ChildProcess(process, fleet=fleet, folder=folder, hang_s=hang_s) for process in PROCESSES
+            process.name: ChildProcess(process, fleet=fleet, folder=folder, hang_s=hang_s) for process in processes
         }
         self._link = ServiceLink(bus, 1)
         self._alive = bus.watch_alive()
@@ -147,7 +150,7 @@ class Supervisor:
     def _start_due(self) -> None:
         now_s = self._now_s()
         for name, child in self._children.items():
-            ready = all(self._children[other].is_ready for other in child.process.after)
+            ready = all(self._children[other].is_ready for other in child.process.after if other in self._children)
             if child.is_due(now_s) and (ready or child.epoch > 0):
                 child.start(now_s, self._environment(name, child.epoch + 1))
 
@@ -164,6 +167,7 @@ class Supervisor:
 
         Where every frame is mapped, the mapper knows by itself when that is, and needs the tracker until then.
         In realtime the tracker says what was dropped to the last frame, and the mapper takes what there is.
+        A recorder ends when there is nothing new to record.
         """
         sensor, mapper, tracker = (self._children[process.name] for process in (SENSOR, MAPPER, TRACKER))
         second, last = (tracker, mapper) if self._pacing is Pacing.REALTIME else (mapper, tracker)
@@ -182,6 +186,12 @@ class Supervisor:
             else:
                 self._end(tracker)
             if last.finished:
+                self._phase = _Phase.RECORDING
+        if self._phase is _Phase.RECORDING:
+            recorder = self._children.get(RECORDER.name)
+            if recorder is not None:
+                self._end(recorder)
+            if recorder is None or recorder.finished:
                 self._phase = _Phase.ENDED
 
     def _end(self, child: ChildProcess) -> None:

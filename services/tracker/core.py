@@ -47,6 +47,10 @@ class Tracker:
     engine: Engine
     threads: int = 1
 
+    def tracks(self, frame: Frame, *, is_first: bool) -> bool:
+        """Whether a frame is tracked: not the first, nor one that is to be mapped at the pose that it comes with."""
+        return not is_first and (self.settings.enabled or frame.pose_prior is None)
+
     def track(
         self,
         frame: Frame,

@@ -14,7 +14,7 @@ from vtslam.common.topics import TRACKER_ODOMETRY, TRACKER_POSE
 from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.service_link import ServiceLink
-from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackResult, first_pose
+from vtslam.services.tracker.state import UNKNOWN_VARIANCE, TrackerState, TrackResult, untracked_pose
 
 
 class PosePublisher:
@@ -58,7 +58,7 @@ class PosePublisher:
             read_s: Seconds that reading it took.
             track_s: Seconds that tracking it took.
         """
-        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
+        T_world_camera = untracked_pose(frame) if result is None else result.T_world_camera
         covariance = np.zeros((6, 6)) if result is None else _sendable(result.covariance)
         self._poses.publish(
             TrackedPose(

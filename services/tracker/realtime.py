@@ -22,7 +22,7 @@ from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_ages import PoseAges
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
-from vtslam.services.tracker.state import TrackerState, TrackResult, first_pose
+from vtslam.services.tracker.state import TrackerState, TrackResult, untracked_pose
 
 _MAX_STEPS_AHEAD = 3.0  # as far as a velocity is trusted, in times of what it was measured over
 
@@ -105,7 +105,7 @@ class RealtimeTracker:
         active_id, num_frames = self._follower.active_id, self._follower.num_frames
         section_id = num_frames // self._section_length if active_id is None else active_id
         state, result = self._remembered(), None
-        if num_frames > 0:
+        if self._tracker.tracks(frame, is_first=num_frames == 0):
             result = self._tracker.track(
                 frame,
                 self._follower.map,
@@ -177,7 +177,7 @@ class RealtimeTracker:
     def _remember(self, state: TrackerState, frame: Frame, result: TrackResult | None) -> TrackerState:
         before = state.previous_frame
         self._step_ns = 0 if before is None else frame.capture_time_ns - before.capture_time_ns
-        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
+        T_world_camera = untracked_pose(frame) if result is None else result.T_world_camera
         self._state = state.after(frame, T_world_camera, result, mean_depth_m(frame))
         return self._state
 

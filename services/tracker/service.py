@@ -16,7 +16,7 @@ from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
-from vtslam.services.tracker.state import TrackerState, TrackResult, first_pose
+from vtslam.services.tracker.state import TrackerState, TrackResult, untracked_pose
 
 
 class TrackerService:
@@ -87,7 +87,7 @@ class TrackerService:
         start_ns = self._clock.monotonic_ns()
         frame = self._ring.copied(descriptor)
         state, result = self._state(frame_id, section_id), None
-        if frame_id > 0:
+        if self._tracker.tracks(frame, is_first=frame_id == 0):
             result = self._tracker.track(
                 frame, self._follower.map, state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
             )
@@ -142,7 +142,7 @@ class TrackerService:
 
     def _after(self, frame: Frame, state: TrackerState, result: TrackResult | None, section_id: int) -> TrackerState:
         """What is remembered with the frame; its pose goes through the section's frame, as the mapper's does."""
-        T_world_camera = first_pose(frame) if result is None else result.T_world_camera
+        T_world_camera = untracked_pose(frame) if result is None else result.T_world_camera
         after = state.after(frame, T_world_camera, result, mean_depth_m(frame))
         active = self._follower.map.active
         if active is None or active.section_id != section_id:

@@ -115,6 +115,6 @@ class TrackerState:
         )
 
 
-def first_pose(frame: Frame) -> npt.NDArray[np.float64]:
-    """``T_world_camera`` float64 [4,4] of the first frame, which defines the world: its prior, or the identity."""
+def untracked_pose(frame: Frame) -> npt.NDArray[np.float64]:
+    """``T_world_camera`` float64 [4,4] of a frame that is not tracked: its prior; else the identity, for the first."""
     return np.eye(4) if frame.pose_prior is None else frame.pose_prior.T_world_camera

@@ -14,7 +14,7 @@ def recording(tmp_path: Path) -> ReplicaRecording:
 
 
 def test_unknown_scheme_lists_the_known_ones() -> None:
-    known = "among replica:DIR, 7scenes:DIR, tum:DIR, .*sim:room.*; found 'tape:x'"
+    known = "among replica:DIR, 7scenes:DIR, tum:DIR, .*sim:room.*, mcap:FILE; found 'tape:x'"
     with pytest.raises(SourceError, match=known):
         open_source("tape:x")
 

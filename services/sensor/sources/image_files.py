@@ -132,14 +132,19 @@ def read_color(path: Path) -> npt.NDArray[np.uint8]:
     return decoded_color(_read_bytes(path, "colour image"), path)
 
 
-def decoded_color(data: bytes, where: Path | str) -> npt.NDArray[np.uint8]:
-    """What :func:`read_color` gives for a file of these bytes; messages begin with ``where``.
+def decoded_color(data: bytes, where: Path | str, size: tuple[int, int] | None = None) -> npt.NDArray[np.uint8]:
+    """The same from the bytes of such a file.
+
+    Args:
+        data: The bytes.
+        where: The file, or another place, for messages.
+        size: Width and height that it must have; unpacking a PNG file of another size is not even tried.
 
     Raises:
-        SourceError: The bytes are cut, damaged, or of another kind.
+        SourceError: The bytes are cut, damaged, of another kind or size.
     """
     if data.startswith(_PNG_SIGNATURE):
-        _check_png(where, data)
+        _check_png(where, data, size)
         if data[24] != 8:
             raise SourceError(f"{where}: expected an 8-bit colour image, found {data[24]} bits per channel")
     elif data.startswith(_JPEG_START):
@@ -150,6 +155,7 @@ def decoded_color(data: bytes, where: Path | str) -> npt.NDArray[np.uint8]:
     else:
         raise SourceError(f"{where}: expected a PNG or JPEG file, found {_head(data)}")
     bgr = _decode(where, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    _check_size(where, bgr, size)
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
 
 
@@ -169,15 +175,21 @@ def read_depth(path: Path) -> npt.NDArray[np.uint16]:
     Raises:
         SourceError: The file is missing, cut, damaged, or of another kind.
     """
-    data = _read_bytes(path, "depth image")
+    return decoded_depth(_read_bytes(path, "depth image"), path)
+
+
+def decoded_depth(data: bytes, path: Path | str, size: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
+    """The same from the bytes of such a file; arguments and errors as those of `decoded_color`."""
     if not data.startswith(_PNG_SIGNATURE):
         raise SourceError(f"{path}: expected a 16-bit PNG file, found {_head(data)}")
-    _check_png(path, data)
+    _check_png(path, data, size)
     bits, color_type = data[24], data[25]
     if bits != 16 or color_type != 0:
         kind = "gray" if color_type == 0 else f"PNG colour type {color_type}"
         raise SourceError(f"{path}: expected 16-bit gray depth, found {bits}-bit {kind}")
-    return np.asarray(_decode(path, data, cv2.IMREAD_UNCHANGED), np.uint16)
+    depth = _decode(path, data, cv2.IMREAD_UNCHANGED)
+    _check_size(path, depth, size)
+    return np.asarray(depth, np.uint16)
 
 
 def _read_bytes(path: Path, what: str) -> bytes:
@@ -189,7 +201,12 @@ def _read_bytes(path: Path, what: str) -> bytes:
         raise SourceError(f"{path}: expected a readable {what}, found {error.strerror}") from error
 
 
-def _check_png(path: Path | str, data: bytes) -> None:
+def _check_size(path: Path | str, image: npt.NDArray[np.generic], size: tuple[int, int] | None) -> None:
+    if size is not None and image.shape[:2] != size[::-1]:
+        raise SourceError(f"{path}: expected an image of {size[0]}x{size[1]}, found {_wxh(image.shape)}")
+
+
+def _check_png(path: Path | str, data: bytes, size: tuple[int, int] | None) -> None:
     """Walk the chunks (length, type, payload, CRC) from IHDR to IEND."""
     at, kind = len(_PNG_SIGNATURE), b""
     while kind != b"IEND":
@@ -207,6 +224,9 @@ def _check_png(path: Path | str, data: bytes) -> None:
         if at == len(_PNG_SIGNATURE) and (kind != b"IHDR" or length != 13):
             raise SourceError(f"{path}: expected a PNG header, found chunk {kind!r} of {length} bytes")
         at = end
+    found: tuple[int, int] = struct.unpack_from(">II", data, 16)
+    if size is not None and found != size:
+        raise SourceError(f"{path}: expected an image of {size[0]}x{size[1]}, found {found[0]}x{found[1]}")
 
 
 def _decode(path: Path | str, data: bytes, flags: int) -> npt.NDArray[np.generic]:

@@ -69,6 +69,12 @@ def _open_sim(uri: SourceUri, size: Size | None) -> Source:
     return SimRoom.open(uri, size=size)
 
 
+def _open_mcap(uri: SourceUri, size: Size | None) -> Source:
+    from vtslam.services.sensor.sources.mcap_recording import open_mcap
+
+    return open_mcap(uri)
+
+
 # Scheme -> (form for messages, opener). Openers import their reader when called: a run needs one of them.
 _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "replica": ("replica:DIR", _open_replica),
@@ -79,6 +85,7 @@ _READERS: dict[str, tuple[str, Callable[[SourceUri, Size | None], Source]]] = {
     "realsense": ("realsense:[SERIAL]", _open_realsense),
     "kitti": ("kitti:DIR", _open_kitti),
     "sim": ("sim:room, sim:city", _open_sim),
+    "mcap": ("mcap:FILE", _open_mcap),
 }
 
 
@@ -114,11 +121,11 @@ def open_source(
         known = ", ".join(form for form, _ in _READERS.values())
         raise SourceError(f"expected a source among {known}; found {uri!r}")
     asked = {key: options.pop(key) for key in OPTIONS if key in options}
-    source = _READERS[parsed.scheme][1](replace(parsed, options=options), size)
+    recording = source = _READERS[parsed.scheme][1](replace(parsed, options=options), size)
     if size is not None:
         source = _resized(source, size)
     if asked:
-        source = with_pose_priors(source, asked)
+        source = with_pose_priors(source, asked, recording=recording)
     if frames is None and range_text is not None:
         frames = _parsed_range(range_text, len(source))
     return source if frames is None else _sub_range(source, frames)

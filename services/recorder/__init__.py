@@ -1,0 +1,1 @@
+"""The recorder: what a fleet sees and finds, in an MCAP file."""

@@ -1,0 +1,75 @@
+"""Poses from elsewhere: as priors of tracking, and in place of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.fleet_runs import ASSIGNMENTS, Disturbance, SmallRecording, result_bytes
+from helpers.mcap_bytes import BagWriter
+
+from vtslam.common.config import ConfigError
+from vtslam.common.trajectory_io import read_trajectory, write_trajectory
+from vtslam.services.cli.__main__ import main
+from vtslam.services.recorded_run import RecordedRun
+from vtslam.services.run_plan import plan_run
+from vtslam.services.sensor.sources.registry import open_source
+
+FRAMES = 8
+
+
+@pytest.fixture
+def poses(small: SmallRecording, tmp_path: Path) -> Path:
+    """The true poses of the small recording, as a file."""
+    source, path = open_source(small.files.uri), tmp_path / "poses.txt"
+    truth = source.ground_truth()
+    assert truth is not None
+    write_trajectory(path, [source.frame(index).capture_time_ns for index in range(len(source))], truth)
+    return path
+
+
+def _words(*assignments: str) -> list[str]:
+    return [word for text in (*ASSIGNMENTS, f"source.frames=0:{FRAMES}", *assignments) for word in ("--set", text)]
+
+
+def _states(run: Path) -> list[str]:
+    return [str(row["state"]) for row in RecordedRun(run).rows]
+
+
+def test_given_poses_take_the_place_of_tracking(small: SmallRecording, poses: Path, tmp_path: Path) -> None:
+    for name, mode in (("one", ["--in-process"]), ("many", [])):
+        words = ["--poses", str(poses), "--tracking", "off", "--out", str(tmp_path / name)]
+        assert main(["run", small.files.uri, *mode, *words, *_words()]) == 0
+    assert result_bytes(tmp_path / "one") == result_bytes(tmp_path / "many")
+    given, found = read_trajectory(poses), read_trajectory(tmp_path / "one" / "trajectory.txt")
+    np.testing.assert_allclose(found.poses, given.poses[:FRAMES], atol=1e-12)
+    for name in ("one", "many"):
+        assert _states(tmp_path / name) == ["first", *["known"] * (FRAMES - 1)]
+
+
+def test_given_poses_guide_tracking(small: SmallRecording, poses: Path, tmp_path: Path) -> None:
+    settings = [*ASSIGNMENTS, f"source.frames=0:{FRAMES}", f'source.poses="{poses}"', 'source.poses_sigma="1e-5,1e-4"']
+    plan_run(small.files.uri, family="tum", assignments=settings).execute(tmp_path / "run")
+    given, found = read_trajectory(poses), read_trajectory(tmp_path / "run" / "trajectory.txt")
+    np.testing.assert_allclose(found.poses, given.poses[:FRAMES], atol=1e-3)
+    assert "known" not in _states(tmp_path / "run")
+
+
+def test_poses_of_a_bag_are_mapped_at_in_a_fleet(small: SmallRecording, tmp_path: Path) -> None:
+    source, bag = open_source(small.files.uri), BagWriter()
+    truth = source.ground_truth()
+    assert truth is not None
+    for index in range(FRAMES):
+        frame = source.frame(index)
+        bag.add_frame(frame)
+        bag.add_transform("/tf", "world", "optical", truth[index], frame.capture_time_ns)
+    path = bag.write(tmp_path / "bag.mcap")
+    settings = [*ASSIGNMENTS, f"source.frames=0:{FRAMES}", 'source.poses="/tf"', "tracker.enabled=false"]
+    uri = f"mcap:{path}?depth_scale={1.0 / source.depth_scale_m!r}"
+    plan_run(uri, assignments=settings).execute_in_fleet(tmp_path / "run", Disturbance().hooks())
+    found = read_trajectory(tmp_path / "run" / "trajectory.txt")
+    np.testing.assert_allclose(found.poses, truth[:FRAMES], atol=1e-9)
+
+
+def test_without_poses_tracking_cannot_be_off(small: SmallRecording) -> None:
+    with pytest.raises(ConfigError, match=r"--tracking off: .*expected a pose for the first frame"):
+        plan_run(small.files.uri, assignments=["tracker.enabled=false"])
