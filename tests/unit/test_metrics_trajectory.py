@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from vtslam.common.geometry import se3
-from vtslam.common.metrics_trajectory import aligning_motion, trajectory_errors
+from vtslam.common.metrics_trajectory import aligning_motion, segment_drift_pct, trajectory_errors
 
 
 def random_walk(num_frames: int, *, seed: int = 3) -> np.ndarray:
@@ -98,3 +98,12 @@ def test_refuses_other_lengths_and_nan() -> None:
     estimated[2, 0, 3] = np.nan
     with pytest.raises(ValueError, match="finite poses"):
         trajectory_errors(estimated, truth)
+
+
+def test_drift_over_stretches_is_a_share_of_their_length() -> None:
+    truth = np.tile(np.eye(4), (301, 1, 1))
+    truth[:, 2, 3] = np.arange(301)
+    estimated = truth.copy()
+    estimated[:, 2, 3] *= 1.02
+    assert segment_drift_pct(estimated, truth) == pytest.approx(2.0)
+    assert segment_drift_pct(estimated[:100], truth[:100]) is None
