@@ -8,6 +8,8 @@ import numpy.typing as npt
 from vtslam.common.geometry import se3
 
 Poses = npt.NDArray[np.float64]
+_SEGMENT_LENGTHS_M = tuple(range(100, 900, 100))
+_SEGMENT_STEP = 10  # frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,6 +50,34 @@ def trajectory_errors(estimated: Poses, truth: Poses) -> TrajectoryErrors:
         rpe_rot_rmse_deg=float(np.rad2deg(_rms(rot_rad))) if rot_rad.size else None,
         position_error_m=error_m,
     )
+
+
+def segment_drift_pct(estimated: Poses, truth: Poses) -> float | None:
+    """The mean drift over stretches of 100, 200, ... 800 m, in percent of their length, as KITTI defines it.
+
+    Args:
+        estimated: ``T_world_camera`` float64 [F,4,4].
+        truth: The same frames' true ones. A stretch begins at every 10th.
+
+    Returns:
+        The mean over all stretches; None if the drive is shorter than 100 m.
+
+    Raises:
+        ValueError: As :func:`trajectory_errors`.
+    """
+    _check(estimated, truth)
+    steps_m = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
+    driven_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    drifts_pct = []
+    for first in range(0, len(truth), _SEGMENT_STEP):
+        for length_m in _SEGMENT_LENGTHS_M:
+            last = int(np.searchsorted(driven_m, driven_m[first] + length_m))
+            if last == len(truth):
+                break
+            motion = se3.inverse(estimated[first]) @ estimated[last]
+            error = se3.inverse(se3.inverse(truth[first]) @ truth[last]) @ motion
+            drifts_pct.append(100.0 * float(np.linalg.norm(error[:3, 3])) / length_m)
+    return float(np.mean(drifts_pct)) if drifts_pct else None
 
 
 def aligning_motion(points: npt.NDArray[np.float64], targets: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

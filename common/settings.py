@@ -278,7 +278,7 @@ class FleetSettings:
         lead: Frames that tracking is ahead of mapping when pipelined.
         replay_hz: Frames per second of a recording in realtime; 0 as they were captured.
         tracker_threads, mapper_threads: Threads of these processes; 0 as splat.threads.
-        map_budget_mb: Shared memory for the map, 10^6 bytes.
+        map_budget_mb: Shared memory for the map, 10^6 bytes; finished sections leave it for the run folder as needed.
         hang_s: A process whose work loop is silent for so long is killed and started again; more than any step takes.
         metrics_port: Where 127.0.0.1 answers Prometheus; 0 for nowhere.
     """
@@ -288,7 +288,7 @@ class FleetSettings:
     replay_hz: Annotated[float, Range(0.0, 1000.0)] = 0.0
     tracker_threads: Annotated[int, Range(0, 256)] = 0
     mapper_threads: Annotated[int, Range(0, 256)] = 0
-    map_budget_mb: Annotated[int, Range(16, 10**7)] = 4000
+    map_budget_mb: Annotated[int, Range(1, 10**7)] = 4000
     hang_s: Annotated[float, Range(5.0, 86400.0)] = 300.0
     metrics_port: Annotated[int, Range(0, 65535)] = 0
 

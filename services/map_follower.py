@@ -1,6 +1,6 @@
 """The map store as a process that only reads it follows it: the last commit, and the map as of then."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -23,16 +23,20 @@ class StoreArchive:
     Args:
         store: The map store.
         elsewhere: Where sections are that are not in memory.
+        on_reload: Told whenever one is read from there.
     """
 
-    def __init__(self, store: MapStore, elsewhere: ReadsSections) -> None:
-        self._store, self._elsewhere = store, elsewhere
+    def __init__(
+        self, store: MapStore, elsewhere: ReadsSections, *, on_reload: Callable[[], None] = lambda: None
+    ) -> None:
+        self._store, self._elsewhere, self._on_reload = store, elsewhere, on_reload
 
     def read(self, section_id: int) -> Section:
         """A finished section: a copy, so that it may leave the store."""
         try:
             held = self._store.pinned_sealed(section_id)
         except SectionNotResident:
+            self._on_reload()
             return self._elsewhere.read(section_id)
         try:
             return _copied(held.section).retied()

@@ -1,5 +1,6 @@
 """What a process can say of itself (memory, the versions its results may depend on), and of other processes."""
 
+import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -45,6 +46,15 @@ def private_rss_mb(pid: int) -> float:
         return _status_mb(Path(f"/proc/{pid}/status"), "RssAnon:")
     except OSError:
         return 0.0
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor time that a process has used with all its threads; 0 if there is no such one."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()  # the name before it may hold anything
+    except OSError:
+        return 0.0
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _status_mb(path: Path, key: str) -> float:

@@ -30,10 +30,18 @@ _LEFTOVER = re.compile(r"\.(?:new|old)-([0-9a-f]+)-.+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resident:
-    """A sealed section in memory: its bytes, and pids of living processes that have it pinned."""
+    """A sealed section in memory.
+
+    Attributes:
+        section_id: The section.
+        num_bytes: What it takes.
+        last_used_ns: When it was sealed or pinned last, by the system's clock.
+        pinned_by: Pids of living processes that have it pinned.
+    """
 
     section_id: int
     num_bytes: int
+    last_used_ns: int
     pinned_by: tuple[int, ...]
 
 
@@ -49,15 +57,29 @@ class MapStore:
     def __init__(self, folder: Path, *, budget_bytes: int, pins: int = 8) -> None:
         folder.mkdir(mode=0o700, exist_ok=True)
         self._folder, self.budget_bytes, self._pins = folder, budget_bytes, pins
+        self._sealed_bytes: dict[int, int] = {}  # by section, as they were seen; they never change
 
     # --- what is there ----------------------------------------------------------------------------------------------
 
     def used_bytes(self) -> int:
         """Bytes reserved by all blocks."""
-        total = 0
+        total = sum(self.sealed_bytes().values())
         for folder, _, names in os.walk(self._folder):
-            total += sum(used_bytes(Path(folder, name)) for name in names)
+            total += sum(used_bytes(Path(folder, name)) for name in names if not name.startswith("sealed-"))
         return total
+
+    def sealed_bytes(self) -> dict[int, int]:
+        """Bytes of each sealed section in memory, in order."""
+        known = self._sealed_bytes
+        self._sealed_bytes = {
+            section_id: known.get(section_id) or used_bytes(self._path("sealed", section_id))
+            for section_id in self.sealed_ids()
+        }
+        return self._sealed_bytes
+
+    def free_bytes(self) -> int:
+        """Bytes that can be reserved: the rest of the budget, or of the file system if that has less."""
+        return min(self.budget_bytes - self.used_bytes(), shutil.disk_usage(self._folder).free)
 
     def active_id(self) -> int | None:
         """The section being mapped, if any."""
@@ -72,10 +94,17 @@ class MapStore:
     def residents(self) -> list[Resident]:
         """The sealed sections in memory, with what decides whether they may leave."""
         found = []
-        for section_id in self.sealed_ids():
+        for section_id, num_bytes in self.sealed_bytes().items():
             path = self._path("sealed", section_id)
-            pinned = tuple(sealed_pin_holders(path))
-            found.append(Resident(section_id=section_id, num_bytes=used_bytes(path), pinned_by=pinned))
+            with contextlib.suppress(FileNotFoundError):
+                found.append(
+                    Resident(
+                        section_id=section_id,
+                        num_bytes=num_bytes,
+                        last_used_ns=path.stat().st_mtime_ns,
+                        pinned_by=tuple(sealed_pin_holders(path)),
+                    )
+                )
         return found
 
     def last_commit(self) -> LastCommit | None:

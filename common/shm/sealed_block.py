@@ -139,6 +139,7 @@ class PinnedSealed:
             control = ControlPage.open(path, fd, Kind.SEALED)
             description = control.description(_SEALED)
             data = mapped(fd, control.file_bytes - CONTROL_BYTES, offset=CONTROL_BYTES, writable=False)
+            os.utime(fd)  # tells when it was used last
         finally:
             os.close(fd)
         if verify and zlib.crc32(data.data) != description["crc32"]:

@@ -221,15 +221,23 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     chaos.add_argument(
         "source", nargs="?", default="sim:room?frames=120&size=160x120", metavar="SOURCE", help="default: %(default)s"
     )
+    city = kinds.add_parser("city", help="a long drive through the simulated town as a fleet: does anything grow?")
+    city.add_argument("--frames", type=int, metavar="N", help="the first N (default: the whole drive)")
+    city.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
+    city.add_argument("--budget-mb", type=int, default=48, metavar="B", help="of the map (default: %(default)s)")
+    city.add_argument("--trajectory", type=Path, metavar="FILE", help="KITTI poses to drive along, not round a block")
+    city.add_argument("--laps", type=int, default=3, metavar="L", help="of 300 m round a block (default: %(default)s)")
+    city.add_argument("--pose-prior", metavar="M,DEG", help="give the true poses along, with errors of such sizes")
     overlap = kinds.add_parser("overlap", help="choosing overlapping sections on a long road")
     overlap.add_argument("--views", type=int, default=100_000, metavar="N", help="along it (default: %(default)s)")
     overlap.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
     for kind in (track, mapping, curves, system, basin, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    _add_layers(city)
     for kind in (track, mapping, curves, system, basin, codec, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, overlap, track, mapping, curves, system, basin, codec, fleet, chaos):
+    for kind in (splat, overlap, city, track, mapping, curves, system, basin, codec, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

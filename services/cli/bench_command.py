@@ -8,6 +8,7 @@ from vtslam.common.config import ConfigError
 from vtslam.common.preset_loading import load_settings
 from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
 from vtslam.services.bench.chaos import bench_chaos, is_sound
+from vtslam.services.bench.city import CityDrive, bench_city
 from vtslam.services.bench.codec import bench_codec, steps
 from vtslam.services.bench.codec_picture import write_codec_picture
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
@@ -46,6 +47,7 @@ def _measured(args: Namespace) -> dict[str, object]:
         "codec": _codec,
         "curves": _curves,
         "chaos": _chaos,
+        "city": _city,
         "fleet": _fleet,
         "overlap": _overlap,
     }
@@ -128,6 +130,30 @@ def _fleet(args: Namespace) -> dict[str, object]:
         rounds=args.rounds, live_seconds=args.live_seconds, live_sizes=(_size(args.latency_size), _size(args.live_size))
     )
     return bench_fleet(_plan(args), parts, bench, on_part=lambda text: print(f"bench fleet: {text}", file=sys.stderr))
+
+
+def _city(args: Namespace) -> dict[str, object]:
+    if args.budget_mb < 1 or args.laps < 1 or (args.frames is not None and args.frames < 1):
+        raise ConfigError(
+            "bench city: expected --budget-mb, --laps and --frames of at least 1, "
+            f"found {args.budget_mb}, {args.laps}, {args.frames}"
+        )
+    drive = CityDrive(
+        frames=args.frames,
+        size=_size(args.size),
+        budget_mb=args.budget_mb,
+        trajectory=args.trajectory,
+        laps=args.laps,
+        pose_prior=args.pose_prior,
+    )
+
+    def plan(uri: str, assignments: list[str]) -> RunPlan:
+        words = [*assignments, *args.assignments]
+        return plan_run(uri, preset=args.preset, family=args.family, config=args.config, assignments=words)
+
+    run_plan = plan(drive.uri, drive.assignments)
+    with Progress(len(run_plan.source), what="driving", unit="frame") as progress:
+        return bench_city(drive, run_plan, on_frame=lambda facts: progress.step())
 
 
 def _recording(args: Namespace) -> dict[str, object]:

@@ -18,6 +18,8 @@ from vtslam.common.fleet_folder import FleetFolder, read_owner
 if TYPE_CHECKING:
     from vtslam.common.bus import Bus, Steps
     from vtslam.common.settings import Settings
+    from vtslam.common.shm.map_store import MapStore
+    from vtslam.services.map_follower import StoreArchive
     from vtslam.services.pacing import Pace
     from vtslam.services.service_link import ServiceLink
     from vtslam.storage.run_folder import RunFolder
@@ -126,17 +128,16 @@ def _sensor(parts: _Parts) -> "Steps":
 
 def _tracker(parts: _Parts) -> "Steps":
     from vtslam.services.engines import make_engine, thread_count, with_threads
-    from vtslam.services.map_follower import MapFollower, StoreArchive
+    from vtslam.services.map_follower import MapFollower
     from vtslam.services.supervisor.store import map_store
     from vtslam.services.tracker.core import Tracker
     from vtslam.services.tracker.realtime import RealtimeTracker
     from vtslam.services.tracker.service import TrackerService
-    from vtslam.storage.section_convert import SectionArchive
 
     settings, store = parts.settings, map_store(parts.folder, parts.settings)
     follower = MapFollower(
         store,
-        StoreArchive(store, SectionArchive(parts.run)),
+        _archive(parts, store),
         candidate_interval=settings.section.candidate_interval,
     )
     splat, length = with_threads(settings.splat, settings.fleet.tracker_threads), settings.section.length
@@ -149,10 +150,8 @@ def _tracker(parts: _Parts) -> "Steps":
 
 def _mapper(parts: _Parts) -> "Steps":
     from vtslam.services.engines import make_engine, with_threads
-    from vtslam.services.map_follower import StoreArchive
     from vtslam.services.mapper.service import FleetPaths, MapperService
     from vtslam.services.supervisor.store import map_store
-    from vtslam.storage.section_convert import SectionArchive
 
     store = map_store(parts.folder, parts.settings)
     return MapperService(
@@ -161,10 +160,19 @@ def _mapper(parts: _Parts) -> "Steps":
         parts.settings,
         make_engine(with_threads(parts.settings.splat, parts.settings.fleet.mapper_threads)),
         store,
-        StoreArchive(store, SectionArchive(parts.run)),
+        _archive(parts, store),
         FleetPaths(ring=parts.folder.ring_path, journal=parts.folder.journal_path),
         parts.pace,
     )
+
+
+def _archive(parts: _Parts, store: "MapStore") -> "StoreArchive":
+    """Sealed sections: the map store's, and the run folder's for those that left it."""
+    from vtslam.services.map_follower import StoreArchive
+    from vtslam.storage.section_convert import SectionArchive
+
+    on_disk = SectionArchive(parts.run)
+    return StoreArchive(store, on_disk, on_reload=lambda: parts.link.count("sections.reloaded"))
 
 
 def _recorder(parts: _Parts) -> "Steps":

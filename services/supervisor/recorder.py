@@ -3,16 +3,15 @@
 import contextlib
 from collections.abc import Callable
 
-from vtslam.common.shm.errors import SectionPinned, SharedMemoryError
+from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame, FrameFacts
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.run_record import RunRecord, RunSummary
+from vtslam.services.supervisor.residency import Residency
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import record_of
-
-_RESIDENT_SECTIONS = 6  # sealed sections left in shared memory; others are on disk only
 
 
 class Recorder:
@@ -23,13 +22,16 @@ class Recorder:
         store: The map store.
         journal: Committed frames.
         on_frame: Called once for each committed frame.
+
+    Attributes:
+        residency: Lets sections leave memory.
     """
 
     def __init__(
         self, run: RunFolder, store: MapStore, journal: JournalReader, on_frame: Callable[[FrameFacts], None]
     ) -> None:
         self._run, self._store, self._journal, self._on_frame = run, store, journal, on_frame
-        self._record = RunRecord(run)
+        self._record, self.residency = RunRecord(run), Residency(store)
         self._next_section = len(run.catalog.sections())
         journal.forget_before(self._next_section)
         self._ended: dict[int, CommitFacts] = {}  # by section: sealed, and all its frames are known
@@ -40,13 +42,14 @@ class Recorder:
         return self._record.num_frames
 
     def step(self, *, make_room: bool = False) -> None:
-        """Take in what is new, and let sections that are on disk leave memory, all but one if ``make_room``.
+        """Take in what is new; sections on disk leave memory as its budget asks for, all but one if ``make_room``.
 
         Raises:
             StorageError: The run folder cannot be written.
         """
         self._take_frames()
-        self._archive(resident=1 if make_room else _RESIDENT_SECTIONS)
+        self._archive()
+        self.residency.step(self._next_section, squeeze=make_room)
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
         """Write everything that is not written yet; see `RunRecord.finish`."""
@@ -63,7 +66,7 @@ class Recorder:
                 self._take(facts.frame)
                 if last.is_sealed and last.section_id >= self._next_section:
                     self._ended[last.section_id] = facts
-                    self._archive(resident=_RESIDENT_SECTIONS)
+                    self._archive()
         self._record.finish_broken(seconds=seconds, peak_rss_mb=peak_rss_mb)
 
     def _take_frames(self) -> None:
@@ -78,16 +81,11 @@ class Recorder:
         if is_new:
             self._on_frame(frame.facts)
 
-    def _archive(self, *, resident: int) -> None:
+    def _archive(self) -> None:
         while self._next_section in self._ended:
             self._write(self._next_section)
             self._next_section += 1
             self._journal.forget_before(self._next_section)
-        sealed = self._store.sealed_ids()
-        for section_id in sealed[: max(len(sealed) - resident, 0)]:
-            if section_id < self._next_section:
-                with contextlib.suppress(SectionPinned):
-                    self._store.unlink_sealed(section_id, verified_on_disk=True)
 
     def _write(self, section_id: int) -> None:
         """Make a section durable; the map store keeps it until then."""

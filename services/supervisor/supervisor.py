@@ -15,6 +15,7 @@ from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import ProcessRefused
 from vtslam.services.supervisor.processes import MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, Process
 from vtslam.services.supervisor.recorder import Recorder
+from vtslam.services.supervisor.residency import Residency
 
 _POLL_S = 0.1  # between looks at the processes, when the bus is silent
 
@@ -81,6 +82,11 @@ class Supervisor:
     def children(self) -> Mapping[str, ChildProcess]:
         """The processes by name."""
         return self._children
+
+    @property
+    def residency(self) -> Residency:
+        """What the map takes."""
+        return self._recorder.residency
 
     def stop(self) -> None:
         """End the fleet in order: what was published is mapped, the open section sealed. Further calls do nothing."""
@@ -158,6 +164,7 @@ class Supervisor:
         for name, child in self._children.items():
             self._link.counters[f"{name}.deaths"] = child.deaths
             self._link.counters[f"{name}.hangs"] = child.hangs
+        self._link.gauges["map_peak_mb"] = 1e-6 * self.residency.peak_bytes
         self._link.tell(state, self._recorder.num_frames - 1, detail=f"{self._pacing}, {self._phase.value}")
 
     # --- ending -----------------------------------------------------------------------------------------------------

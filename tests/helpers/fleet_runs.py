@@ -81,6 +81,7 @@ class Disturbance:
         events: What the supervisor told.
         pids: All that were seen.
         children: The processes as their supervisor sees them.
+        map_peak_bytes, map_sealed_bytes: See `Residency`.
     """
 
     signals: list[tuple[int, str, signal.Signals]] = field(default_factory=list)
@@ -89,6 +90,8 @@ class Disturbance:
     pids: set[int] = field(default_factory=set)
     children: Mapping[str, ChildProcess] = field(default_factory=dict)
     frames: int = 0
+    map_peak_bytes: int = 0
+    map_sealed_bytes: int = 0
 
     @property
     def deaths(self) -> dict[str, int]:
@@ -118,6 +121,7 @@ class Disturbance:
 
     def _step(self, supervisor: Supervisor) -> None:
         self.children = supervisor.children
+        self.map_peak_bytes, self.map_sealed_bytes = supervisor.residency.peak_bytes, supervisor.residency.sealed_bytes
         for child in supervisor.children.values():
             if child.pid is not None:
                 self.pids.add(child.pid)

@@ -70,6 +70,18 @@ def test_curves_show_what_more_steps_are_worth(tmp_path: Path) -> None:
     assert main(["bench", "curves", *words[:-1], "1,x"]) == 2
 
 
+def test_a_drive_through_town_tells_what_grows(tmp_path: Path) -> None:
+    words = ["--frames", "10", "--size", "80x24", "--budget-mb", "2", "--pose-prior", "0.3,0.5"]
+    values = bench("city", *words, "--set", "section.length=2", result=tmp_path / "city.json")
+    assert (values["frames"], values["sections"], values["lost"]) == (10, 5, 0)
+    assert 0 < values["shm_peak_mb"] <= 2.0
+    assert min(values[key] for key in ("map_mb", "map_disk_mb", "recording_mb", "disk_mb_per_s")) > 0
+    assert min(values[key] for key in ("rss_growth", "time_growth")) > 0
+    assert values["sections_reloaded"] >= 0
+    assert values["ate_rmse_m"] < 0.3
+    assert values["drift_pct"] is None  # of stretches of 100 m
+
+
 def test_track_stands_beside_opencv_on_the_same_frames(tmp_path: Path) -> None:
     values = bench("track", *SMALL, result=tmp_path / "track.json")
     assert values["ate_rmse_m"] < 0.02

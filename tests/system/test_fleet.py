@@ -17,6 +17,7 @@ from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.supervisor import residency
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.run_folder import RunFolder
 
@@ -95,7 +96,21 @@ def test_priors_of_poses_are_used_and_outlive_processes(small: SmallRecording, t
     assert result_bytes(tmp_path / "one") != small.undisturbed
 
 
-def test_a_map_that_fills_its_memory_waits_for_the_disk(small: SmallRecording, tmp_path: Path) -> None:
+def test_sections_leave_memory_within_the_budget_and_are_read_again(small: SmallRecording, tmp_path: Path) -> None:
+    plan = small_plan(small.files, "section.length=2", "tracker.overlap.max_sections=5", "fleet.map_budget_mb=3")
+    plan.execute(tmp_path / "one")
+    calm = Disturbance()
+    plan.execute_in_fleet(tmp_path / "many", calm.hooks())
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
+    assert calm.children["tracker"].counters["sections.reloaded"] > 0
+    assert 0 < calm.map_peak_bytes <= 3_000_000
+
+
+def test_a_map_that_fills_its_memory_waits_for_the_disk(
+    small: SmallRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(residency, "_MARGIN", 0.0)  # nothing leaves before the mapper asks for room
     plan = small_plan(small.files, "source.size=200x150", "source.frames=0:8", *LARGE_MAP)
     plan.execute(tmp_path / "one")
     calm = Disturbance()

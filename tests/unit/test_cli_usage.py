@@ -45,7 +45,7 @@ RUN = ("run", "sim:room", "--size", "48x36", "--frames", "0:2", "--out", "out/ru
 @pytest.mark.parametrize(
     ("words", "status", "text"),
     [
-        ((*RUN, "--set", "fleet.map_budget_mb=1"), 2, "fleet.map_budget_mb = 1: expected an integer"),
+        ((*RUN, "--set", "fleet.map_budget_mb=0"), 2, "fleet.map_budget_mb = 0: expected an integer"),
         ((*RUN, "--in-process", "--set", "section.lenght=3"), 2, "did you mean section.length?"),
         ((*RUN, "--in-process", "--set", "section.length=1"), 2, "expected an integer in the range [2, 10000]"),
         ((*RUN, "--in-process", "--holdout", "-1"), 2, "holdout = -1: expected an integer >= 0"),

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from vtslam.common.geometry import se3
-from vtslam.common.metrics_trajectory import aligning_motion, trajectory_errors
+from vtslam.common.metrics_trajectory import aligning_motion, segment_drift_pct, trajectory_errors
 
 
 def random_walk(num_frames: int, *, seed: int = 3) -> np.ndarray:
@@ -113,3 +113,12 @@ def test_frames_without_a_true_pose_are_left_out() -> None:
     assert errors.rpe_trans_rmse_m < 0.06
     with pytest.raises(ValueError, match="of which some are finite"):
         trajectory_errors(estimated, np.full_like(truth, np.nan))
+
+
+def test_drift_over_stretches_is_a_share_of_their_length() -> None:
+    truth = np.tile(np.eye(4), (301, 1, 1))
+    truth[:, 2, 3] = np.arange(301)
+    estimated = truth.copy()
+    estimated[:, 2, 3] *= 1.02
+    assert segment_drift_pct(estimated, truth) == pytest.approx(2.0)
+    assert segment_drift_pct(estimated[:100], truth[:100]) is None
