@@ -21,6 +21,7 @@ from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED
 from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.frame_facts import CommittedFrame, Seconds, frame_facts, untracked_state
 from vtslam.services.frame_journal import JournalWriter
+from vtslam.services.free_memory import give_back_free_memory
 from vtslam.services.mapper.pose_intake import EveryPose, NewestPose, PoseIntake
 from vtslam.services.mapper.state import ActiveSection, CommitRecord
 from vtslam.services.mapper.turns import MapperTurns
@@ -279,7 +280,9 @@ class MapperService:
                 epoch=self._link.epoch,
             )
         )
-        return self._announce(facts)
+        patience_s = self._announce(facts)
+        give_back_free_memory()
+        return patience_s
 
     def _end_of(self, active: ActiveSection) -> tuple[Section, int, CommitFacts]:
         assert self._facts is not None

@@ -123,8 +123,8 @@ class Tracker:
         # The surfaces of all of them and of the previous section count beside S^o's own: the head then agrees with
         # where it came from and with everything it closes on, sections meet without a step, and less hangs on which
         # one is chosen.
-        beside = [map_reader.section(i) for i in sorted({*ids, section_id - 1})]
-        return [_with_surfaces_of(map_reader.section(i), beside) for i in ids]
+        beside = {i: map_reader.section(i) for i in sorted({*ids, section_id - 1})}  # read once: few stay at hand
+        return [_with_surfaces_of(beside[i], list(beside.values())) for i in ids]
 
     def _attempt(
         self,

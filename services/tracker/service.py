@@ -10,6 +10,7 @@ from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.topics import MAPPER_COMMITTED
+from vtslam.services.free_memory import give_back_free_memory
 from vtslam.services.map_follower import MapFollower
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 from vtslam.services.tracker.core import Tracker
@@ -69,6 +70,8 @@ class TrackerService:
             self._link.tell(ServiceState.FINISHED, self._proposed)
             return None
         if self._track_next():
+            if self._proposed % self._section_length == 0:  # what was compared to find the head's pose is gone
+                give_back_free_memory()
             self._link.tell(ServiceState.WORKING, self._proposed)
             return 0.0
         self._link.tell(ServiceState.READY, self._proposed)
