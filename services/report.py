@@ -1,18 +1,15 @@
 """The report of a run: ``report.json`` and pictures, in the run folder."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from vtslam.common.metrics_trajectory import aligning_motion, trajectory_errors
 from vtslam.services.evaluation import write_metrics
 from vtslam.services.recorded_run import RecordedRun
-from vtslam.services.report_pictures import Picture, frame_picture, in_columns, stacked
+from vtslam.services.report_pictures import Picture, frame_picture, in_columns, stacked, write_picture
 from vtslam.services.report_plot import trajectory_plot
-from vtslam.storage.atomic import replace_file
 
 REPORT_NAME = "report.json"
 _PICTURES = "pictures"
@@ -41,7 +38,7 @@ def write_report(run: RecordedRun, values: Mapping[str, Any]) -> dict[str, objec
     plot, sheet = _trajectory(run), in_columns(list(strips.values()), 2)
     pictures = {"overview.png": stacked([plot, sheet]), "trajectory.png": plot, **strips}
     for name, picture in pictures.items():
-        _write_picture(folder / name, picture)
+        write_picture(folder / name, picture)
     facts = run.info.facts
     about = {"source": facts.source, "preset": facts.preset, "family": facts.family, "created_by": facts.created_by}
     names = [f"{_PICTURES}/{name}" for name in pictures]
@@ -69,8 +66,3 @@ def _trajectory(run: RecordedRun) -> Picture:
     T_estimate_truth = aligning_motion(truth[:, :3, 3], estimated_m)
     true_m = truth[:, :3, 3] @ T_estimate_truth[:3, :3].T + T_estimate_truth[:3, 3]
     return trajectory_plot(estimated_m, true_m, trajectory_errors(run.poses, truth).position_error_m, heads)
-
-
-def _write_picture(path: Path, picture: Picture) -> None:
-    encoded = cv2.imencode(".png", picture)[1]
-    replace_file(path, [encoded.tobytes()])

@@ -1,6 +1,7 @@
 """Pictures that show a run to people: what was seen, what the map shows instead, and where they differ."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,6 +9,8 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.splat.engine import Rendering
+from vtslam.storage.atomic import replace_file
+from vtslam.storage.errors import WriteFailed
 
 Picture = npt.NDArray[np.uint8]  # [H,W,3], blue first, as OpenCV writes files
 
@@ -33,6 +36,17 @@ def frame_picture(frame: Frame, rendering: Rendering) -> Picture:
         ("difference (white: 5 cm)", _gray(depth_error_m / 0.05)),
     ]
     return stacked([beside([labelled(tile, text) for text, tile in row]) for row in (color, depth)])
+
+
+def write_picture(path: Path, picture: Picture) -> None:
+    """Write a picture as the file type that the name ends in; raises WriteFailed."""
+    try:
+        written, encoded = cv2.imencode(path.suffix, picture)
+    except cv2.error:
+        written = False
+    if not written:
+        raise WriteFailed(f"{path}: expected a name that ends in .png or .jpg")
+    replace_file(path, [encoded.tobytes()])
 
 
 def labelled(tile: npt.NDArray[np.uint8], text: str) -> Picture:

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from vtslam.services.report_pictures import write_picture
 from vtslam.services.report_plot import ESTIMATED_COLOR, TRUE_COLOR, Line, Panel, Points, plotted
-from vtslam.storage.errors import WriteFailed
 
 _QUALITIES = {"psnr_heldout_db": "held-out frames", "psnr_paper_db": "training frames"}
 _COLORS = {"dense": ESTIMATED_COLOR, "dense_rate": TRUE_COLOR}
@@ -19,12 +18,7 @@ _SIZE_PX = (480, 380)
 def write_codec_picture(path: Path, found: Mapping[str, Any]) -> None:
     """Draw what :func:`vtslam.services.bench.codec.bench_codec` found with curves; raises WriteFailed."""
     panels = [_panel(found, key, words) for key, words in _QUALITIES.items()]
-    try:
-        written = cv2.imwrite(str(path), plotted(panels, size=_SIZE_PX))
-    except cv2.error as error:
-        raise WriteFailed(f"{path}: expected a name that ends in .png or .jpg") from error
-    if not written:
-        raise WriteFailed(f"{path}: cannot write the picture")
+    write_picture(path, plotted(panels, size=_SIZE_PX))
 
 
 def _panel(found: Mapping[str, Any], key: str, words: str) -> Panel:

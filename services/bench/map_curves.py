@@ -5,13 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from vtslam.services.bench.recording import bench_map
+from vtslam.services.report_pictures import write_picture
 from vtslam.services.report_plot import ESTIMATED_COLOR, TRUE_COLOR, Line, Panel, Points, plotted
 from vtslam.services.run_plan import RunPlan
-from vtslam.storage.errors import WriteFailed
 
 _STEPS = ("iterations_head", "iterations_regular", "iterations_seal")
 _QUALITIES = {"psnr_paper_db": "training frames", "psnr_heldout_db": "held-out frames"}
@@ -53,12 +52,7 @@ def _with_share(plan: RunPlan, share: float) -> RunPlan:
 def write_map_picture(path: Path, curves: Mapping[str, Any]) -> None:
     """Draw quality over milliseconds per frame (logarithm to base 10); raises WriteFailed."""
     panels = [_panel(curves, key, words) for key, words in _QUALITIES.items()]
-    try:
-        written = cv2.imwrite(str(path), plotted([panel for panel in panels if panel.lines], size=_SIZE_PX))
-    except cv2.error as error:
-        raise WriteFailed(f"{path}: expected a name that ends in .png or .jpg") from error
-    if not written:
-        raise WriteFailed(f"{path}: cannot write the picture")
+    write_picture(path, plotted([panel for panel in panels if panel.lines], size=_SIZE_PX))
 
 
 def _panel(curves: Mapping[str, Any], key: str, words: str) -> Panel:

@@ -83,36 +83,18 @@ def run_in_fleet(
     fleet = fleet or f"run-{os.getpid()}-{secrets.token_hex(3)}"
     folder = FleetFolder.create(fleet, run_folder=str(run.path.resolve()), base=base)
     try:
-        processes = processes_of(settings)
-        for process in processes:
-            folder.reserve_failure(process.name)
         store, metrics = map_store(folder, settings), FleetMetrics()
 
         def on_frame(facts: FrameFacts) -> None:
             metrics.observe(facts)
             hooks.on_frame(facts)
 
-        def on_event(text: str) -> None:
-            run.catalog.add_event("restarted", text)
-            hooks.on_event(text)
-
         if resume is not None:
-            section = SectionArchive(run).read(resume.section_id)
-            store.restore(section, resume.frame, resume.facts.packed())
+            store.restore(SectionArchive(run).read(resume.section_id), resume.frame, resume.facts.packed())
         recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
         access = None if door is None else door.access_of(folder.path)
         with Hub(folder.path, fleet, access) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
-            supervisor = Supervisor(
-                bus,
-                fleet=fleet,
-                folder=folder,
-                processes=processes,
-                recorder=recorder,
-                hang_s=settings.fleet.hang_s,
-                pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,
-                on_event=on_event,
-                environment=hooks.environment,
-            )
+            supervisor = _supervisor(bus, fleet, folder, recorder, run, settings, hooks)
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
                 try:
                     interrupted = _supervised(supervisor, bus, hooks)
@@ -130,6 +112,37 @@ def run_in_fleet(
     if supervisor.refusal is not None:
         raise SourceError(str(supervisor.refusal))
     return summary
+
+
+def _supervisor(
+    bus: Bus,
+    fleet: str,
+    folder: FleetFolder,
+    recorder: Recorder,
+    run: RunFolder,
+    settings: Settings,
+    hooks: FleetHooks,
+) -> Supervisor:
+    """The supervisor of a run, which has started nothing yet."""
+    processes = processes_of(settings)
+    for process in processes:
+        folder.reserve_failure(process.name)
+
+    def on_event(text: str) -> None:
+        run.catalog.add_event("restarted", text)
+        hooks.on_event(text)
+
+    return Supervisor(
+        bus,
+        fleet=fleet,
+        folder=folder,
+        processes=processes,
+        recorder=recorder,
+        hang_s=settings.fleet.hang_s,
+        pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,
+        on_event=on_event,
+        environment=hooks.environment,
+    )
 
 
 def _peak_rss_mb(supervisor: Supervisor) -> float:

@@ -10,25 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import small_runs
 from helpers.sections import assert_same_section, frames_of, small_section
 
 from vtslam.storage import run_folder
 from vtslam.storage.errors import MalformedSection, RunFolderError, RunLocked, UnreadableFile, WriteFailed
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.run_info import RunFacts, RunInfo
 from vtslam.storage.section_file import write_section
 
-INFO = RunInfo(
-    facts=RunFacts(
-        created_by="vtslam 0.1.0",
-        source="sim:room?seed=3",
-        family="tum",
-        preset="fast",
-        width=320,
-        height=240,
-        first_frame=0,
-        end_frame=60,
-    ),
+INFO = replace(
+    small_runs.INFO,
     settings={"seed": 2, "tracker": {"optimizer": "gauss_newton", "weights": [1.0, 0.5]}},
     versions={"vtslam": "0.1.0", "numpy": "2.4"},
 )
@@ -260,9 +251,9 @@ def test_facts_of_frames(path: Path) -> None:
             r"expected format, \[run\], \[versions\] and \[settings\], found ",
         ),
         ('numpy = "2.4"', "numpy = 2.4", r"versions\.numpy: expected a string, found 2\.4"),
-        ("width = 320", "width = -1", r"run\.toml \[run\]: width = -1: expected an integer >= 0"),
-        ("width = 320", "widht = 320", r"widht = 320: unknown key; did you mean width\?"),
-        ("width = 320\n", "", "width: no value given; expected an integer >= 0"),
+        ("width = 6", "width = -1", r"run\.toml \[run\]: width = -1: expected an integer >= 0"),
+        ("width = 6", "widht = 320", r"widht = 320: unknown key; did you mean width\?"),
+        ("width = 6\n", "", "width: no value given; expected an integer >= 0"),
         ("end_frame = 60", "end_frame = -1", r"end_frame = -1: expected an integer >= 0"),
         ("first_frame = 0", "first_frame = 61", "frames: expected first_frame <= end_frame, found 61:60"),
         ('source = "sim', 'source = "sim\n', r"run\.toml:\d+: not TOML: "),

@@ -51,6 +51,46 @@ class Source(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SourceAround:
+    """A source that changes the frames of another, and is like it in all else.
+
+    Attributes:
+        inner: The other.
+        uri: The text that opens the changed one.
+    """
+
+    inner: Source
+    uri: str
+
+    @property
+    def family(self) -> str:
+        """As `Source.family`."""
+        return self.inner.family
+
+    @property
+    def camera(self) -> Camera:
+        """As `Source.camera`."""
+        return self.inner.camera
+
+    @property
+    def depth_scale_m(self) -> float:
+        """As `Source.depth_scale_m`."""
+        return self.inner.depth_scale_m
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.inner)
+
+    def frame(self, index: int) -> Frame:
+        """As `Source.frame`."""
+        return self.inner.frame(index)
+
+    def ground_truth(self) -> npt.NDArray[np.float64] | None:
+        """As `Source.ground_truth`."""
+        return self.inner.ground_truth()
+
+
 @runtime_checkable
 class LiveCamera(Protocol):
     """What a source that is a camera offers beside `Source`: its frames are there once, and never end."""

@@ -11,9 +11,8 @@ import numpy.typing as npt
 from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
-from vtslam.common.geometry.camera import Camera
 from vtslam.common.trajectory_io import TrajectoryError, read_trajectory
-from vtslam.services.sensor.sources.base import Source, SourceError, with_option
+from vtslam.services.sensor.sources.base import Source, SourceAround, SourceError, with_option
 
 OPTIONS = ("poses", "poses_sigma", "prior")
 _DEFAULT_SIGMA = "0.05,1"
@@ -38,34 +37,14 @@ class RecordsPoses(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _WithPriors:
+class _WithPriors(SourceAround):
     """A source whose frames have pose priors."""
 
-    inner: Source
-    uri: str
     prior_of: PriorOf
-
-    @property
-    def family(self) -> str:
-        return self.inner.family
-
-    @property
-    def camera(self) -> Camera:
-        return self.inner.camera
-
-    @property
-    def depth_scale_m(self) -> float:
-        return self.inner.depth_scale_m
-
-    def __len__(self) -> int:
-        return len(self.inner)
 
     def frame(self, index: int) -> Frame:
         frame = self.inner.frame(index)
         return replace(frame, pose_prior=self.prior_of(frame, index))
-
-    def ground_truth(self) -> npt.NDArray[np.float64] | None:
-        return self.inner.ground_truth()
 
 
 def with_pose_priors(source: Source, options: dict[str, str], *, recording: Source | None = None) -> Source:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.services.sensor.sources.base import Source, SourceError, SourceUri, with_option
+from vtslam.services.sensor.sources.base import Source, SourceAround, SourceError, SourceUri, with_option
 from vtslam.services.sensor.sources.pose_priors import OPTIONS, with_pose_priors
 
 Size = tuple[int, int]
@@ -132,51 +132,25 @@ def open_source(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Resized:
+class _Resized(SourceAround):
     """A source whose frames are scaled by `Frame.resized`."""
 
-    inner: Source
-    uri: str
-    camera: Camera
-
-    @property
-    def family(self) -> str:
-        return self.inner.family
-
-    @property
-    def depth_scale_m(self) -> float:
-        return self.inner.depth_scale_m
-
-    def __len__(self) -> int:
-        return len(self.inner)
-
-    def frame(self, index: int) -> Frame:
-        return self.inner.frame(index).resized(self.camera.width, self.camera.height)
-
-    def ground_truth(self) -> npt.NDArray[np.float64] | None:
-        return self.inner.ground_truth()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _SubRange:
-    """Frames ``first`` to ``end - 1`` of a source; ids count from 0, capture times stay the recording's."""
-
-    inner: Source
-    uri: str
-    first: int
-    end: int
-
-    @property
-    def family(self) -> str:
-        return self.inner.family
+    scaled: Camera
 
     @property
     def camera(self) -> Camera:
-        return self.inner.camera
+        return self.scaled
 
-    @property
-    def depth_scale_m(self) -> float:
-        return self.inner.depth_scale_m
+    def frame(self, index: int) -> Frame:
+        return self.inner.frame(index).resized(self.scaled.width, self.scaled.height)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _SubRange(SourceAround):
+    """Frames ``first`` to ``end - 1`` of a source; ids count from 0, capture times stay the recording's."""
+
+    first: int
+    end: int
 
     def __len__(self) -> int:
         return self.end - self.first
@@ -198,7 +172,7 @@ def _resized(source: Source, size: Size) -> Source:
     if size == (source.camera.width, source.camera.height):
         return source
     uri = with_option(source.uri, "size", f"{width}x{height}")
-    return _Resized(inner=source, uri=uri, camera=source.camera.resized(width, height))
+    return _Resized(inner=source, uri=uri, scaled=source.camera.resized(width, height))
 
 
 def _sub_range(source: Source, frames: tuple[int, int]) -> Source:

@@ -1,7 +1,6 @@
 """The simulated source ``sim:city``: a car's camera driving through a procedural town, with exact ground truth."""
 
 import os
-import re
 from functools import lru_cache
 from pathlib import Path as FilePath
 
@@ -24,6 +23,7 @@ from vtslam.services.sensor.sources.sim_city_path import (
 )
 from vtslam.services.sensor.sources.sim_city_streets import path_streets, segments
 from vtslam.services.sensor.sources.sim_city_traffic import Traffic
+from vtslam.services.sensor.sources.sim_options import SimOptions, num_threads
 
 DEPTH_SCALE_M = 1.0 / 256.0
 FRAME_PERIOD_NS = 100_000_000  # 10 Hz
@@ -33,7 +33,7 @@ NOISES = ("none", "stereo")
 _KITTI = Camera.from_integer_centred(width=1241, height=376, fx=718.856, fy=718.856, cx=607.1928, cy=185.2157)
 _OPTIONS = ("laps", "block", "trajectory", "traffic", "seed", "noise", "size")
 _MAX_LAPS, _MAX_LAP_M, _MAX_SEED, _MAX_SIDE, _MAX_TRAFFIC = 10_000, 20_000, 2**31 - 1, 8192, 100
-_SIZE = re.compile(r"([0-9]+)x([0-9]+)")
+_CHECKED = SimOptions("sim:city")
 
 
 class SimCity:
@@ -70,12 +70,12 @@ class SimCity:
         noise: str = "stereo",
         size: tuple[int, int] = (_KITTI.width, _KITTI.height),
     ) -> None:
-        _check("laps", laps, 1, _MAX_LAPS)
-        _check("block", block, int(MIN_LAP_M) + 1, _MAX_LAP_M)
-        _check("traffic", traffic, 0, _MAX_TRAFFIC)
-        _check("seed", seed, 0, _MAX_SEED)
-        _check("size, width", size[0], 1, _MAX_SIDE)
-        _check("size, height", size[1], 1, _MAX_SIDE)
+        _CHECKED.check("laps", laps, 1, _MAX_LAPS)
+        _CHECKED.check("block", block, int(MIN_LAP_M) + 1, _MAX_LAP_M)
+        _CHECKED.check("traffic", traffic, 0, _MAX_TRAFFIC)
+        _CHECKED.check("seed", seed, 0, _MAX_SEED)
+        _CHECKED.check("size, width", size[0], 1, _MAX_SIDE)
+        _CHECKED.check("size, height", size[1], 1, _MAX_SIDE)
         if noise not in NOISES:
             raise SourceError(f"sim:city: noise must be one of {', '.join(NOISES)}; got {noise!r}")
         if trajectory:
@@ -110,13 +110,13 @@ class SimCity:
         if "trajectory" in options and {"laps", "block"} & options.keys():
             raise SourceError("sim:city: trajectory=FILE goes without laps and block")
         return cls(
-            laps=_whole("laps", options.get("laps", "1")),
-            block=_whole("block", options.get("block", "300")),
+            laps=_CHECKED.whole("laps", options.get("laps", "1")),
+            block=_CHECKED.whole("block", options.get("block", "300")),
             trajectory=options.get("trajectory", ""),
-            traffic=_whole("traffic", options.get("traffic", "0")),
-            seed=_whole("seed", options.get("seed", "0")),
+            traffic=_CHECKED.whole("traffic", options.get("traffic", "0")),
+            seed=_CHECKED.whole("seed", options.get("seed", "0")),
             noise=options.get("noise", "stereo"),
-            size=size or _size(options.get("size", f"{_KITTI.width}x{_KITTI.height}")),
+            size=size or _CHECKED.size(options.get("size", f"{_KITTI.width}x{_KITTI.height}"), usual="620x188"),
         )
 
     def __len__(self) -> int:
@@ -138,7 +138,7 @@ class SimCity:
             camera.height,
             (camera.fx, camera.fy, camera.cx, camera.cy),
             *body_arrays(self._traffic.cars(index), self._texture_names),
-            _num_threads(),
+            num_threads(),
         )
         if self._noise == "stereo":
             rng = np.random.Generator(np.random.Philox(key=[self._seed, index]))
@@ -166,29 +166,6 @@ class SimCity:
         return self._town
 
 
-def _num_threads() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 @lru_cache(maxsize=1)
 def _textures(seed: int) -> dict[str, npt.NDArray[np.uint8]]:
-    return textures(seed, num_threads=_num_threads())
-
-
-def _check(name: str, value: int, low: int, high: int) -> None:
-    if not low <= value <= high:
-        raise SourceError(f"sim:city: {name} must be {low} to {high}; got {value}")
-
-
-def _whole(name: str, text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise SourceError(f"sim:city: {name} must be a whole number; got {text!r}") from None
-
-
-def _size(text: str) -> tuple[int, int]:
-    match = _SIZE.fullmatch(text)
-    if match is None:
-        raise SourceError(f"sim:city: size must read WxH, as in 620x188; got {text!r}")
-    return int(match[1]), int(match[2])
+    return textures(seed, num_threads=num_threads())

@@ -1,7 +1,5 @@
 """The simulated source ``sim:room``: a furnished room seen by a hand-held RGB-D camera, with exact ground truth."""
 
-import os
-import re
 from functools import lru_cache
 
 import numpy as np
@@ -13,6 +11,7 @@ from vtslam.services.sensor.sources import sim_kinect, sim_path
 from vtslam.services.sensor.sources._raycast import Scene
 from vtslam.services.sensor.sources.base import SourceError, SourceUri
 from vtslam.services.sensor.sources.sim_layout import PATH_CENTRE_M, furnished_room
+from vtslam.services.sensor.sources.sim_options import SimOptions, num_threads
 
 DEPTH_SCALE_M = 0.0002
 FRAME_PERIOD_NS = 33_333_333  # 30 Hz
@@ -20,7 +19,7 @@ NOISES = ("none", "kinect")
 
 _FOCAL_PER_WIDTH = 525.0 / 640.0
 _MAX_FRAMES, _MAX_SEED, _MAX_SIDE = 100_000, 2**31 - 1, 8192
-_SIZE = re.compile(r"([0-9]+)x([0-9]+)")
+_CHECKED = SimOptions("sim:room")
 
 
 class SimRoom:
@@ -46,10 +45,10 @@ class SimRoom:
     def __init__(
         self, *, frames: int = 120, seed: int = 0, noise: str = "none", size: tuple[int, int] = (640, 480)
     ) -> None:
-        _check("frames", frames, 2, _MAX_FRAMES)
-        _check("seed", seed, 0, _MAX_SEED)
-        _check("size, width", size[0], 1, _MAX_SIDE)
-        _check("size, height", size[1], 1, _MAX_SIDE)
+        _CHECKED.check("frames", frames, 2, _MAX_FRAMES)
+        _CHECKED.check("seed", seed, 0, _MAX_SEED)
+        _CHECKED.check("size, width", size[0], 1, _MAX_SIDE)
+        _CHECKED.check("size, height", size[1], 1, _MAX_SIDE)
         if noise not in NOISES:
             raise SourceError(f"sim:room: noise must be one of {', '.join(NOISES)}; got {noise!r}")
         width, height = size
@@ -74,10 +73,10 @@ class SimRoom:
             raise SourceError(f"sim:room: unknown option {unknown[0]!r}; allowed are frames, seed, noise and size")
         options = uri.options
         return cls(
-            frames=_whole("frames", options.get("frames", "120")),
-            seed=_whole("seed", options.get("seed", "0")),
+            frames=_CHECKED.whole("frames", options.get("frames", "120")),
+            seed=_CHECKED.whole("seed", options.get("seed", "0")),
             noise=options.get("noise", "none"),
-            size=size or _size(options.get("size", "640x480")),
+            size=size or _CHECKED.size(options.get("size", "640x480"), usual="320x240"),
         )
 
     def __len__(self) -> int:
@@ -98,7 +97,7 @@ class SimRoom:
             camera.width,
             camera.height,
             (camera.fx, camera.fy, camera.cx, camera.cy),
-            _num_threads(),
+            num_threads(),
         )
         if self._noise == "kinect":
             rng = np.random.Generator(np.random.Philox(key=[self._seed, index]))
@@ -118,29 +117,6 @@ class SimRoom:
         return self._poses.copy()
 
 
-def _num_threads() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 @lru_cache(maxsize=2)
 def _scene(seed: int) -> Scene:
-    return furnished_room(seed, num_threads=_num_threads())
-
-
-def _check(name: str, value: int, low: int, high: int) -> None:
-    if not low <= value <= high:
-        raise SourceError(f"sim:room: {name} must be {low} to {high}; got {value}")
-
-
-def _whole(name: str, text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise SourceError(f"sim:room: {name} must be a whole number; got {text!r}") from None
-
-
-def _size(text: str) -> tuple[int, int]:
-    match = _SIZE.fullmatch(text)
-    if match is None:
-        raise SourceError(f"sim:room: size must read WxH, as in 320x240; got {text!r}")
-    return int(match[1]), int(match[2])
+    return furnished_room(seed, num_threads=num_threads())
