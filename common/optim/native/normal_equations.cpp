@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <thread>
 #include <vector>
 
@@ -22,15 +23,15 @@ constexpr int kPackedChannels = 10, kSampled = 9;
 constexpr int kLanes = 16, kBatch = 64;
 constexpr int kBatchesInFloat = 32;  // sums of so many batches stay in float
 constexpr float kNearest = 0.01f;    // metres
+constexpr int64_t kWorthThreads = 20000;  // measurements; fewer take less time than a thread takes to start
 
 // Huber: weight and cost of a residual in sigmas.
 VTSLAM_INLINE float huber_weight(float r) {
-  const float a = std::fabs(r);
-  return a <= 1.0f ? 1.0f : 1.0f / a;
+  return 1.0f / std::max(std::fabs(r), 1.0f);
 }
 VTSLAM_INLINE float huber_cost(float r) {
-  const float a = std::fabs(r);
-  return a <= 1.0f ? 0.5f * a * a : a - 0.5f;
+  const float a = std::fabs(r), squared = std::min(a, 1.0f);
+  return squared * (a - 0.5f * squared);
 }
 
 VTSLAM_INLINE float depth_sigma(float z, const AlignmentOptions& options) {
@@ -125,17 +126,23 @@ VTSLAM_CLONES void depth_band(const ReferencePoints& points, const DepthView& vi
   alignas(64) Lane J[6], weight, residual, cost, measured, counted;
   alignas(64) Lane px, py, pz, nx, ny, nz;
   alignas(64) int column[kBatch], row[kBatch];
+  alignas(64) Lane in[6] = {};
+  const Pinhole camera = view.camera;  // copies: what is read under a condition is not vectorised
+  const float gate = options.depth_gate_sigmas, depth_weight = options.depth_weight;
+  const float width = view.width, height = view.height;
   for (int64_t first = begin; first < end; first += kBatch) {
     const int count = static_cast<int>(std::min<int64_t>(kBatch, end - first));
     const float* packed = points.packed + 6 * first;
+    for (int l = 0; l < count; ++l)
+      for (int i = 0; i < 6; ++i) in[i][l] = packed[6 * l + i];
     for (int l = 0; l < kBatch; ++l) {
-      const float* in = packed + 6 * (l < count ? l : 0);
-      const Point p = motion.moved({in[0], in[1], in[2]}), normal = motion.rotated({in[3], in[4], in[5]});
-      const bool in_front = l < count && p.z > kNearest;
+      const Point p = motion.moved({in[0][l], in[1][l], in[2][l]});
+      const Point normal = motion.rotated({in[3][l], in[4][l], in[5][l]});
+      const bool in_front = (l < count) & (p.z > kNearest);
       const float inverse_z = 1.0f / (in_front ? p.z : 1.0f);
-      const float u = view.camera.fx * p.x * inverse_z + view.camera.cx;
-      const float v = view.camera.fy * p.y * inverse_z + view.camera.cy;
-      const bool inside = in_front && u >= 0.0f && v >= 0.0f && u < view.width && v < view.height;
+      const float u = camera.fx * p.x * inverse_z + camera.cx;
+      const float v = camera.fy * p.y * inverse_z + camera.cy;
+      const bool inside = in_front & (u >= 0.0f) & (v >= 0.0f) & (u < width) & (v < height);
       px[l] = p.x, py[l] = p.y, pz[l] = p.z;
       nx[l] = normal.x, ny[l] = normal.y, nz[l] = normal.z;
       column[l] = inside ? static_cast<int>(u) : 0;
@@ -146,17 +153,17 @@ VTSLAM_CLONES void depth_band(const ReferencePoints& points, const DepthView& vi
     for (int l = 0; l < kBatch; ++l) {
       const Point p{px[l], py[l], pz[l]}, normal{nx[l], ny[l], nz[l]};
       const float d = measured[l];
-      const Point q = back_projected(column[l] + 0.5f, row[l] + 0.5f, d > 0.0f ? d : 1.0f, view.camera);
+      const Point q = back_projected(column[l] + 0.5f, row[l] + 0.5f, d > 0.0f ? d : 1.0f, camera);
       const float distance = dot(normal, {q.x - p.x, q.y - p.y, q.z - p.z});
       // Noise is along the ray: it shortens with the slant when measured along the normal.
       const float slant = std::fabs(dot(normal, q)) / std::sqrt(dot(q, q));
       const float sigma = depth_sigma(d, options) * std::max(slant, 0.2f);
       const float r = distance / sigma;
-      const bool used = d > 0.0f && std::fabs(r) <= options.depth_gate_sigmas;
+      const bool used = (d > 0.0f) & (std::fabs(r) <= gate);
       twist_rows(J, l, p, Point{-normal.x, -normal.y, -normal.z});
       residual[l] = used ? distance : 0.0f;
-      weight[l] = used ? options.depth_weight * huber_weight(r) / (sigma * sigma) : 0.0f;
-      cost[l] = used ? options.depth_weight * huber_cost(r) : 0.0f;
+      weight[l] = used ? depth_weight * huber_weight(r) / (sigma * sigma) : 0.0f;
+      cost[l] = used ? depth_weight * huber_cost(r) : 0.0f;
       counted[l] = used ? 1.0f : 0.0f;
     }
     for (int l = 0; l < kBatch; ++l) out.depth_count += counted[l] > 0.0f;
@@ -165,6 +172,8 @@ VTSLAM_CLONES void depth_band(const ReferencePoints& points, const DepthView& vi
   sums.finish(out, out.depth_cost);
 }
 
+using Eight = float __attribute__((vector_size(32)));
+
 // Colour and its two derivatives at (x, y), pixel centres at whole numbers, between four pixels.
 VTSLAM_INLINE void bilinear(const ObservedView& observed, float x, float y, float* out) {
   const int u = std::min(static_cast<int>(x), observed.width - 2);
@@ -172,11 +181,17 @@ VTSLAM_INLINE void bilinear(const ObservedView& observed, float x, float y, floa
   const float a = x - u, b = y - v;
   const float* p = observed.packed + (static_cast<size_t>(v) * observed.width + u) * kPackedChannels;
   const float* q = p + static_cast<size_t>(observed.width) * kPackedChannels;
-  for (int c = 0; c < kSampled; ++c) {
-    const float top = p[c] + a * (p[c + kPackedChannels] - p[c]);
-    const float bottom = q[c] + a * (q[c + kPackedChannels] - q[c]);
-    out[c] = top + b * (bottom - top);
-  }
+  Eight p0, p1, q0, q1;
+  std::memcpy(&p0, p, sizeof p0);
+  std::memcpy(&p1, p + kPackedChannels, sizeof p1);
+  std::memcpy(&q0, q, sizeof q0);
+  std::memcpy(&q1, q + kPackedChannels, sizeof q1);
+  const Eight top = p0 + a * (p1 - p0), bottom = q0 + a * (q1 - q0), sampled = top + b * (bottom - top);
+  std::memcpy(out, &sampled, sizeof sampled);
+  constexpr int last = kSampled - 1;
+  const float last_top = p[last] + a * (p[last + kPackedChannels] - p[last]);
+  const float last_bottom = q[last] + a * (q[last + kPackedChannels] - q[last]);
+  out[last] = last_top + b * (last_bottom - last_top);
 }
 
 // Pixels of the rendered view whose place in the frame is known, gathered until a batch is full.
@@ -216,38 +231,69 @@ VTSLAM_INLINE void add_colors(ColorBatch& batch, const Pinhole& camera, const Al
   batch.count = 0;
 }
 
+// Up to a batch of neighbouring pixels of the rendered view, warped into the frame.
+struct WarpedRow {
+  alignas(64) Lane x, y, z, u, v;  // the point in the frame's camera, and its place in the frame
+  alignas(64) int nearest[kBatch], used[kBatch];
+};
+
+// Warps `count` pixels from (column, row) on, and marks those that the frame sees at the same place.
+VTSLAM_INLINE void warp_row(const ReferenceView& reference, const ObservedView& observed, const Motion& motion,
+                            const AlignmentOptions& options, int column, int row, int count, WarpedRow& out) {
+  const Pinhole& camera = observed.camera;
+  const float border = options.border_px + 0.5f;
+  const float right = observed.width - border, bottom = observed.height - border;
+  const size_t first = static_cast<size_t>(row) * observed.width + column;
+  alignas(64) Lane depth = {};
+  for (int l = 0; l < count; ++l) depth[l] = reference.mask[first + l] ? reference.depth[first + l] : 0.0f;
+  for (int l = 0; l < kBatch; ++l) {
+    const float z = depth[l];
+    const Point p = motion.moved(back_projected(column + l + 0.5f, row + 0.5f, z, camera));
+    const bool in_front = (z > 0.0f) & (p.z > kNearest);
+    const float inverse_z = 1.0f / (in_front ? p.z : 1.0f);
+    const float u = camera.fx * p.x * inverse_z + camera.cx, v = camera.fy * p.y * inverse_z + camera.cy;
+    const bool inside = in_front & (u >= border) & (v >= border) & (u < right) & (v < bottom);
+    out.x[l] = p.x, out.y[l] = p.y, out.z[l] = p.z;
+    out.u[l] = u, out.v[l] = v;
+    out.nearest[l] = inside ? static_cast<int>(v) * observed.width + static_cast<int>(u) : 0;
+    out.used[l] = inside;
+  }
+  for (int l = 0; l < kBatch; ++l) {
+    const float d = observed.packed[static_cast<size_t>(out.nearest[l]) * kPackedChannels + kSampled];
+    const float gate = options.depth_gate_sigmas * depth_sigma(d, options);
+    out.used[l] &= (d > 0.0f) & (std::fabs(d - out.z[l]) <= gate);
+  }
+}
+
 // Colour differences between rows begin to end of a rendered view, warped, and one pyramid level of the frame.
 VTSLAM_CLONES void color_band(const ReferenceView& reference, const ObservedView& observed, const Motion& motion,
                               const AlignmentOptions& options, int begin, int end, NormalEquations& out) {
   Sums sums;
   ColorBatch batch = {};
-  const Pinhole& camera = observed.camera;
-  const float border = options.border_px + 0.5f;
+  WarpedRow warped;
+  int chosen[kBatch];
   for (int v = begin; v < end; ++v) {
-    for (int u = 0; u < observed.width; ++u) {
-      const size_t i = static_cast<size_t>(v) * observed.width + u;
-      const float z = reference.depth[i];
-      if (!reference.mask[i] || !(z > 0.0f)) continue;
-      const Point p = motion.moved(back_projected(u + 0.5f, v + 0.5f, z, camera));
-      if (!(p.z > kNearest)) continue;
-      const float image_u = camera.fx * p.x / p.z + camera.cx, image_v = camera.fy * p.y / p.z + camera.cy;
-      if (!(image_u >= border && image_v >= border && image_u < observed.width - border &&
-            image_v < observed.height - border))
-        continue;
-      const size_t nearest = static_cast<size_t>(image_v) * observed.width + static_cast<size_t>(image_u);
-      const float d = observed.packed[nearest * kPackedChannels + kSampled];
-      if (!(d > 0.0f && std::fabs(d - p.z) <= options.depth_gate_sigmas * depth_sigma(d, options))) continue;
-      const int l = batch.count++;
-      float sample[kSampled];
-      bilinear(observed, image_u - 0.5f, image_v - 0.5f, sample);
-      for (int c = 0; c < kSampled; ++c) batch.sampled[c][l] = sample[c];
-      for (int c = 0; c < 3; ++c) batch.rendered[c][l] = reference.rgb[3 * i + c];
-      batch.x[l] = p.x, batch.y[l] = p.y, batch.z[l] = p.z;
-      ++out.color_count;
-      if (batch.count == kBatch) add_colors(batch, camera, options, sums);
+    for (int first = 0; first < observed.width; first += kBatch) {
+      warp_row(reference, observed, motion, options, first, v, std::min(kBatch, observed.width - first), warped);
+      int found = 0;
+      for (int l = 0; l < kBatch; ++l) {
+        chosen[found] = l;
+        found += warped.used[l];
+      }
+      out.color_count += found;
+      for (int k = 0; k < found; ++k) {
+        const int from = chosen[k], to = batch.count++;
+        const float* rendered = reference.rgb + 3 * (static_cast<size_t>(v) * observed.width + first + from);
+        float sample[kSampled];
+        bilinear(observed, warped.u[from] - 0.5f, warped.v[from] - 0.5f, sample);
+        for (int c = 0; c < kSampled; ++c) batch.sampled[c][to] = sample[c];
+        for (int c = 0; c < 3; ++c) batch.rendered[c][to] = rendered[c];
+        batch.x[to] = warped.x[from], batch.y[to] = warped.y[from], batch.z[to] = warped.z[from];
+        if (batch.count == kBatch) add_colors(batch, observed.camera, options, sums);
+      }
     }
   }
-  if (batch.count > 0) add_colors(batch, camera, options, sums);
+  if (batch.count > 0) add_colors(batch, observed.camera, options, sums);
   sums.finish(out, out.color_cost);
 }
 
@@ -267,7 +313,8 @@ NormalEquations normal_equations(const ReferenceView& reference, const ObservedV
                                  const double t[3], const AlignmentOptions& options, int threads) {
   const Motion motion(R, t);
   std::vector<NormalEquations> bands(kBands, NormalEquations{});
-  const int workers = std::min(std::max(threads, 1), kBands);
+  const int64_t measurements = int64_t{observed.width} * observed.height + points.count;
+  const int workers = measurements < kWorthThreads ? 1 : std::min(std::max(threads, 1), kBands);
   auto work = [&](int worker) {
     for (int band = worker; band < kBands; band += workers) {
       if (options.color_weight > 0) {

@@ -186,16 +186,22 @@ bool project(const ProjectArgs& args, uint32_t begin, uint32_t end, uint32_t* ti
 }
 
 // Sums of one Gaussian over its tiles, in the order of kSum*; the order of addition is that of the tiles.
+template <bool geometry>
 VTSLAM_INLINE void add_slots(const float* slots, uint32_t count, float* sums) {
-  for (int part = 0; part < kSlotFloats; part += kLanes) {
-    Vec total = splat(0.0f);
-    for (uint32_t s = 0; s < count; ++s) total = total + load(slots + size_t(s) * kSlotFloats + part);
-    store(sums + part, total);
-  }
+  constexpr int size = slot_floats(geometry);
+  for (int i = 0; i < size; ++i) sums[i] = 0.0f;
+  for (uint32_t s = 0; s < count; ++s)
+    for (int i = 0; i < size; ++i) sums[i] += slots[size_t(s) * size + i];
+}
+
+// The sum kSum* among those that add_slots found.
+template <bool geometry>
+VTSLAM_INLINE float sum_of(const float* sums, int which) {
+  return sums[slot_lane<geometry ? kAllSums : kFewSums>(which)];
 }
 
 struct ChainGroup {
-  alignas(64) float sums[kGroup][kSlotFloats];
+  alignas(64) float sums[kGroup][slot_floats(true)];
   alignas(64) float conic_xx[kGroup], conic_xy[kGroup], conic_yy[kGroup];
   alignas(64) float x[kGroup], y[kGroup], z[kGroup], sigma[kGroup];
   alignas(64) float d_log_radius[kGroup];
@@ -208,7 +214,7 @@ template <bool geometry>
 VTSLAM_INLINE void chain_group(const View& view, ChainGroup& g) {
   for (int l = 0; l < kGroup; ++l) {
     const float* s = g.sums[l];
-    const double mxx = s[slot_lane(kSumXX)], mxy = s[slot_lane(kSumXY)], myy = s[slot_lane(kSumYY)];
+    const double mxx = sum_of<geometry>(s, kSumXX), mxy = sum_of<geometry>(s, kSumXY), myy = sum_of<geometry>(s, kSumYY);
     const double ka = double(g.conic_xx[l]) * (-2.0 * kLn2), kb = double(g.conic_xy[l]) * double(-kLn2);
     const double kc = double(g.conic_yy[l]) * (-2.0 * kLn2);
     const double p00 = ka * mxx + kb * mxy, p01 = ka * mxy + kb * myy;
@@ -220,12 +226,12 @@ VTSLAM_INLINE void chain_group(const View& view, ChainGroup& g) {
     const double by_scale = 2.0 * (d_a * qa * (1.0 + xn * xn) + d_b * qb * xn * yn + d_c * qc * (1.0 + yn * yn));
     g.d_log_radius[l] = float(by_scale);
     if (!geometry) continue;
-    const double mx = s[slot_lane(kSumX)], my = s[slot_lane(kSumY)];
+    const double mx = sum_of<geometry>(s, kSumX), my = sum_of<geometry>(s, kSumY);
     const double d_u = ka * mx + kb * my, d_v = kb * mx + kc * my;
     const double d_xn = view.fx * d_u + 2.0 * d_a * qa * xn + d_b * qb * yn;
     const double d_yn = view.fy * d_v + 2.0 * d_c * qc * yn + d_b * qb * xn;
     const double gx = d_xn * inverse_z, gy = d_yn * inverse_z;
-    const double gz = double(s[slot_lane(kSumDepth)]) - (d_xn * xn + d_yn * yn + by_scale) * inverse_z;
+    const double gz = double(sum_of<geometry>(s, kSumDepth)) - (d_xn * xn + d_yn * yn + by_scale) * inverse_z;
     g.d_point[0][l] = gx;
     g.d_point[1][l] = gy;
     g.d_point[2][l] = gz;
@@ -240,13 +246,14 @@ VTSLAM_INLINE void chain_group(const View& view, ChainGroup& g) {
 
 // Sums over tiles and what the chain rule needs of Gaussian i, or if it has no pixel a harmless stand-in with zero
 // sums, so that the arithmetic stays finite.
+template <bool geometry>
 VTSLAM_INLINE void gather(const ChainArgs& args, uint32_t i, bool present, ChainGroup& g, int l) {
   if (present) {
     const SplatRecord& record = args.records[i];
     const TileRect rect = args.rects[i];
     const uint32_t slots = uint32_t(rect.right - rect.left + 1) * uint32_t(rect.bottom - rect.top + 1);
     const size_t start = size_t(args.chunk_bases[i >> args.chunk_shift]) + args.slot_starts[i];
-    add_slots(args.slots + start * kSlotFloats, slots, g.sums[l]);
+    add_slots<geometry>(args.slots + start * slot_floats(geometry), slots, g.sums[l]);
     g.conic_xx[l] = record.conic_xx;
     g.conic_xy[l] = record.conic_xy;
     g.conic_yy[l] = record.conic_yy;
@@ -255,21 +262,22 @@ VTSLAM_INLINE void gather(const ChainArgs& args, uint32_t i, bool present, Chain
     g.z[l] = args.geometry.z[i];
     g.sigma[l] = args.geometry.sigma[i];
   } else {
-    add_slots(args.slots, 0, g.sums[l]);
+    add_slots<geometry>(args.slots, 0, g.sums[l]);
     g.conic_xx[l] = g.conic_xy[l] = g.conic_yy[l] = g.x[l] = g.y[l] = g.sigma[l] = 0.0f;
     g.z[l] = 1.0f;
   }
 }
 
+template <bool geometry>
 VTSLAM_INLINE void write_gradients(const ChainArgs& args, const ChainGroup& g, int l, uint32_t i) {
   if (args.d_colors != nullptr) {
     const float* s = g.sums[l];
-    args.d_colors[3 * size_t(i)] = s[slot_lane(kSumRed)];
-    args.d_colors[3 * size_t(i) + 1] = s[slot_lane(kSumGreen)];
-    args.d_colors[3 * size_t(i) + 2] = s[slot_lane(kSumBlue)];
-    args.d_opacity_logits[i] = s[slot_lane(kSumAlpha)] * args.geometry.opacity_complement[i];
+    args.d_colors[3 * size_t(i)] = sum_of<geometry>(s, kSumRed);
+    args.d_colors[3 * size_t(i) + 1] = sum_of<geometry>(s, kSumGreen);
+    args.d_colors[3 * size_t(i) + 2] = sum_of<geometry>(s, kSumBlue);
+    args.d_opacity_logits[i] = sum_of<geometry>(s, kSumAlpha) * args.geometry.opacity_complement[i];
     args.d_log_radii[i] = g.d_log_radius[l];
-    if (args.weights != nullptr) args.weights[i] = s[slot_lane(kSumWeight)];
+    if (args.weights != nullptr) args.weights[i] = sum_of<geometry>(s, kSumWeight);
   }
   if (args.d_means == nullptr) return;
   const double* r = args.view.rotation;
@@ -284,9 +292,9 @@ VTSLAM_INLINE void chain_range(const ChainArgs& args, uint32_t begin, uint32_t e
   for (uint32_t first = begin; first < end; first += kGroup) {
     const int count = end - first < kGroup ? int(end - first) : kGroup;
     for (int l = 0; l < kGroup; ++l)
-      gather(args, first + l, l < count && args.rects[first + l].left <= args.rects[first + l].right, g, l);
+      gather<geometry>(args, first + l, l < count && args.rects[first + l].left <= args.rects[first + l].right, g, l);
     chain_group<geometry>(args.view, g);
-    for (int l = 0; l < count; ++l) write_gradients(args, g, l, first + l);
+    for (int l = 0; l < count; ++l) write_gradients<geometry>(args, g, l, first + l);
   }
   for (int i = 0; i < 6; ++i)
     for (int l = 0; l < kGroup; ++l) pose[i] += g.pose[i][l];

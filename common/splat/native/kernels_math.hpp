@@ -10,8 +10,10 @@ namespace {
 constexpr float kLog2E = 1.44269504088896f, kLn2 = 0.693147180559945f;
 
 // Sums over pixels that the backward pass keeps for each (Gaussian, tile) pair. With g = alpha dL/dalpha and d the
-// offset of the pixel centre from the mean: colour and depth weights, the sums of g, g d and g d d^T, and of weights.
-enum { kSumRed, kSumGreen, kSumBlue, kSumDepth, kSumAlpha, kSumX, kSumY, kSumXX, kSumXY, kSumYY, kSumWeight };
+// offset of the pixel centre from the mean: colour weights, the sums of g, weights and g d d^T; and, where derivatives
+// by the geometry are wanted, of g d and of depth weights.
+enum { kSumRed, kSumGreen, kSumBlue, kSumAlpha, kSumWeight, kSumXX, kSumXY, kSumYY, kSumX, kSumY, kSumDepth };
+constexpr int kFewSums = kSumX, kAllSums = 12;
 
 // 2^f for f in [0, 1], minimax of degree 5, relative error below 3e-7; in a form with a short chain of dependences.
 VTSLAM_INLINE Vec exp2_fraction(Vec f) {

@@ -192,9 +192,10 @@ VTSLAM_INLINE bool read_derivatives(const BackwardArgs& args, float* state) {
   return bad == 0;
 }
 
+template <bool geometry>
 VTSLAM_INLINE float* slot_of(const BackwardArgs& args, uint32_t id, const SplatRecord& record) {
   const uint32_t within = record.slot_base + uint32_t(args.tile.tile_y) * record.slot_stride + args.tile.tile_x;
-  return args.slots + (size_t(args.chunk_bases[id >> args.chunk_shift]) + within) * kSlotFloats;
+  return args.slots + (size_t(args.chunk_bases[id >> args.chunk_shift]) + within) * slot_floats(geometry);
 }
 
 template <bool attributes, bool geometry, bool by_alpha>
@@ -212,7 +213,7 @@ VTSLAM_INLINE void backward_splats(const BackwardArgs& args, Vec (*state)[kBackw
     const Footprint f = footprint(record, origin_x, origin_y, lanes);
     const Vec red = splat(record.red), green = splat(record.green), blue = splat(record.blue);
     const Vec depth = splat(record.depth);
-    Vec sums[12];
+    Vec sums[geometry ? kAllSums : kFewSums];
     for (Vec& sum : sums) sum = zero;
     Vec dy = f.row;
     for (int y = f.first_y; y <= f.last_y; ++y, dy = dy + splat(float(kBlockHeight))) {
@@ -250,13 +251,13 @@ VTSLAM_INLINE void backward_splats(const BackwardArgs& args, Vec (*state)[kBackw
         sums[kSumYY] = fma(gy, dy, sums[kSumYY]);
       }
     }
-    store_sums(slot_of(args, id, record), sums);
+    store_sums(slot_of<geometry>(args, id, record), sums);
     if (q % kStopCheckInterval == kStopCheckInterval - 1)
       ended = all_ended(&state[0][kTransmittance], kBackwardChannels);
   }
   for (; q < tile.count; ++q) {
-    float* slot = slot_of(args, tile.order[q], tile.records[tile.order[q]]);
-    for (int i = 0; i < kSlotFloats; i += kLanes) store(slot + i, zero);
+    float* slot = slot_of<geometry>(args, tile.order[q], tile.records[tile.order[q]]);
+    for (int i = 0; i < slot_floats(geometry); ++i) slot[i] = 0.0f;
   }
 }
 

@@ -184,7 +184,7 @@ std::shared_ptr<Rendering> render(const SplatInputs& inputs, uint32_t count, con
 
 void backward(const Rendering& r, const float* d_rgb, const float* d_depth, const float* d_alpha, bool want_attributes,
               bool want_geometry, int threads, GradientArrays& gradients) {
-  const Buffer<float> slots(std::size_t(r.chunk_bases.back()) * kSlotFloats);
+  const Buffer<float> slots(std::size_t(r.chunk_bases.back()) * slot_floats(want_geometry));
   std::atomic<bool> valid{true};
   parallel_for(threads, r.tiles(), [&](std::size_t tile, int) {
     if (!r.kernels->backward_tile({r.tile_args(tile), d_rgb, d_depth, d_alpha, r.chunk_bases.data(), r.chunk_shift,

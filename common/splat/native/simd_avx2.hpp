@@ -58,16 +58,23 @@ VTSLAM_INLINE Vec split_mantissa(Vec a, Vec& exponent) {
   return _mm256_castsi256_ps(_mm256_sub_epi32(_mm256_castps_si256(a), _mm256_slli_epi32(e, 23)));
 }
 
-// Twelve vectors to their sums; lane slot_lane(i) of the result is the sum of v[i].
-constexpr int slot_lane(int i) { return i; }
+// Eight or twelve vectors to their sums; float slot_lane<count>(i) of the result is the sum of v[i].
+template <int count>
+constexpr int slot_lane(int i) {
+  return i;
+}
 VTSLAM_INLINE Vec fold_four(Vec a, Vec b, Vec c, Vec d) {
   return _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
 }
+VTSLAM_INLINE void store_eight(float* out, Vec a, Vec b) {
+  _mm256_store_ps(out, _mm256_permute2f128_ps(a, b, 0x20) + _mm256_permute2f128_ps(a, b, 0x31));
+}
+VTSLAM_INLINE void store_sums(float* out, const Vec (&v)[8]) {
+  store_eight(out, fold_four(v[0], v[1], v[2], v[3]), fold_four(v[4], v[5], v[6], v[7]));
+}
 VTSLAM_INLINE void store_sums(float* out, const Vec (&v)[12]) {
-  const Vec x = fold_four(v[0], v[1], v[2], v[3]), y = fold_four(v[4], v[5], v[6], v[7]);
-  const Vec z = fold_four(v[8], v[9], v[10], v[11]), zero = _mm256_setzero_ps();
-  _mm256_store_ps(out, _mm256_permute2f128_ps(x, y, 0x20) + _mm256_permute2f128_ps(x, y, 0x31));
-  _mm256_store_ps(out + 8, _mm256_permute2f128_ps(z, zero, 0x20) + _mm256_permute2f128_ps(z, zero, 0x31));
+  store_eight(out, fold_four(v[0], v[1], v[2], v[3]), fold_four(v[4], v[5], v[6], v[7]));
+  store_eight(out + 8, fold_four(v[8], v[9], v[10], v[11]), _mm256_setzero_ps());
 }
 
 }  // namespace

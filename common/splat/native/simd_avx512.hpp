@@ -49,13 +49,23 @@ VTSLAM_INLINE Vec split_mantissa(Vec a, Vec& exponent) {
   return m;
 }
 
-// Twelve vectors to their sums; lane slot_lane(i) of the result is the sum of v[i].
-constexpr int slot_lane(int i) { return 4 * (i % 4) + i / 4; }
+// Eight or twelve vectors to their sums; float slot_lane<count>(i) of the result is the sum of v[i].
+template <int count>
+constexpr int slot_lane(int i) {
+  return count / 4 * (i % 4) + i / 4 + (count == 12 ? i % 4 : 0);
+}
 VTSLAM_INLINE Vec fold_halves(Vec a, Vec b) {
   return _mm512_shuffle_f32x4(a, b, 0x44) + _mm512_shuffle_f32x4(a, b, 0xEE);
 }
 VTSLAM_INLINE Vec fold_quarters(Vec a, Vec b) {
   return _mm512_shuffle_f32x4(a, b, 0x88) + _mm512_shuffle_f32x4(a, b, 0xDD);
+}
+VTSLAM_INLINE void store_sums(float* out, const Vec (&v)[8]) {
+  const Vec x = fold_quarters(fold_halves(v[0], v[1]), fold_halves(v[2], v[3]));
+  const Vec y = fold_quarters(fold_halves(v[4], v[5]), fold_halves(v[6], v[7]));
+  const Vec xy = _mm512_unpacklo_ps(x, y) + _mm512_unpackhi_ps(x, y);
+  const __m512d sums = _mm512_castps_pd(xy + _mm512_shuffle_ps(xy, xy, 0x4E));
+  _mm256_store_pd(reinterpret_cast<double*>(out), _mm512_castpd512_pd256(_mm512_maskz_compress_pd(0x55, sums)));
 }
 VTSLAM_INLINE void store_sums(float* out, const Vec (&v)[12]) {
   const Vec zero = _mm512_setzero_ps();

@@ -60,11 +60,15 @@ VTSLAM_INLINE Vec split_mantissa(Vec a, Vec& exponent) {
   return from_bits(bits(a) - (e << 23));
 }
 
-// Twelve vectors to their sums; lane slot_lane(i) of the result is the sum of v[i].
-constexpr int slot_lane(int i) { return i; }
-VTSLAM_INLINE void store_sums(float* out, const Vec (&v)[12]) {
-  for (int i = 0; i < 12; ++i) out[i] = (v[i][0] + v[i][1]) + (v[i][2] + v[i][3]);
-  for (int i = 12; i < 16; ++i) out[i] = 0.0f;
+// Eight or twelve vectors to their sums; float slot_lane<count>(i) of the result is the sum of v[i].
+template <int count>
+constexpr int slot_lane(int i) {
+  return i;
+}
+template <int count>
+VTSLAM_INLINE void store_sums(float* out, const Vec (&v)[count]) {
+  for (int i = 0; i < count; ++i) out[i] = (v[i][0] + v[i][1]) + (v[i][2] + v[i][3]);
+  for (int i = count; i < (count + 7) / 8 * 8; ++i) out[i] = 0.0f;
 }
 
 }  // namespace

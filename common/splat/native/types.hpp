@@ -12,8 +12,8 @@ namespace vtslam::native {
 constexpr int kTile = 32;
 // Gaussians are projected and binned in chunks of at least this many, so that results do not depend on threads.
 constexpr int kMinChunkShift = 13;
-// Floats per slot of gradient sums, one slot per (Gaussian, tile) pair: one cache line.
-constexpr int kSlotFloats = 16;
+// Floats per slot of gradient sums, one slot per (Gaussian, tile) pair: a cache line, or half of one without geometry.
+constexpr int slot_floats(bool geometry) { return geometry ? 16 : 8; }
 // |natural logarithm of sigma| above this is refused: its square overflows single precision twice over.
 constexpr float kMaxLogRadius = 50.0f;
 // A Gaussian whose image mean is further out than this (px) is dropped: a float no longer places it.
