@@ -17,3 +17,11 @@ def thinned(values: npt.NDArray[_Scalar], kept: npt.NDArray[np.bool_]) -> npt.ND
     """
     first = values.shape[0] - kept.size
     return np.concatenate([values[:first], values[first:][kept]])
+
+
+def compacted(values: npt.NDArray[_Scalar], kept: npt.NDArray[np.bool_]) -> npt.NDArray[_Scalar]:
+    """As :func:`thinned`, within the memory of ``values``, which must not be used afterwards."""
+    first = values.shape[0] - kept.size
+    end = first + np.count_nonzero(kept)
+    values[first:end] = values[first:][kept]
+    return values[:end]

@@ -24,6 +24,7 @@ from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.services.sensor.sources.base import Source, SourceError
+from vtslam.services.sensor.sources.read_ahead import ReadAhead
 from vtslam.services.system import FrameReport, Seal, System
 from vtslam.services.tracker.state import TrackerState
 from vtslam.storage.run_folder import RunFolder
@@ -66,12 +67,13 @@ def run_recording(
     recorder = _Recorder(settings, engine, run, resume, recording)
     interrupted = False
     try:
-        for index in range(0 if resume is None else resume.facts.num_frames, len(source)):
-            interrupted = should_stop()
-            if interrupted:
-                break
-            known = None if known_poses is None else known_poses[index]
-            on_frame(recorder.frame(source, index, known))
+        with ReadAhead(source, first=0 if resume is None else resume.facts.num_frames) as frames:
+            while frames.next_index < len(source):
+                interrupted = should_stop()
+                if interrupted:
+                    break
+                known = None if known_poses is None else known_poses[frames.next_index]
+                on_frame(recorder.frame(frames, known))
     except SourceError:
         recorder.close(finished=False, interrupted=False)
         raise
@@ -112,10 +114,10 @@ class _Recorder:
             state = TrackerState.resumed(facts.committed_poses, resume.frame, facts.history, facts.exposure)
             self._system.go_on_after(resume.section_id, num_frames=facts.num_frames, state=state)
 
-    def frame(self, source: Source, index: int, known_T_world_camera: npt.NDArray[np.float64] | None) -> FrameFacts:
+    def frame(self, frames: ReadAhead, known_T_world_camera: npt.NDArray[np.float64] | None) -> FrameFacts:
         """Read and process one frame."""
         start_s = time.perf_counter()
-        frame = source.frame(index)
+        frame = frames.next()
         read_s = time.perf_counter() - start_s
         if self._recording is not None:
             self._recording.add_frame(frame)

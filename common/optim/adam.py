@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from vtslam.common.rows import thinned
+from vtslam.common.rows import compacted
 from vtslam.common.splat import _native
 from vtslam.common.splat.engine import FloatArray
 from vtslam.common.splat.native_engine import checked
@@ -52,7 +52,7 @@ class Adam:
 
     def thin(self, kept: npt.NDArray[np.bool_]) -> None:
         """Leave out those of the last rows that are not ``kept`` (bool [M])."""
-        self.m, self.v = thinned(self.m, kept), thinned(self.v, kept)
+        self.m, self.v = compacted(self.m, kept), compacted(self.v, kept)
 
     def step(self, parameters: FloatArray, gradients: FloatArray, *, rate: float = 1.0) -> None:
         """Move ``parameters`` in place a step of ``rate * lr`` against ``gradients`` (float32, shape of the state).

@@ -10,7 +10,7 @@ from vtslam.common.gaussians import ViewTiedGaussians, first_log_radii
 from vtslam.common.geometry import se3
 from vtslam.common.optim.adam import Adam
 from vtslam.common.optim.mapping_loss import mapping_loss
-from vtslam.common.rows import thinned
+from vtslam.common.rows import compacted, thinned
 from vtslam.common.section import Section, joined_splats
 from vtslam.common.settings import MapperSettings
 from vtslam.common.splat.engine import Engine, Gradients, Splats
@@ -205,11 +205,11 @@ class SectionOptimiser:
         if kept.all():
             return
         self._section = self._section.thinned(kept)
-        self._colors, self._log_radii = thinned(self._colors, kept), thinned(self._log_radii, kept)
-        self._opacity_logits = thinned(self._opacity_logits, kept)
+        self._colors, self._log_radii = compacted(self._colors, kept), compacted(self._log_radii, kept)
+        self._opacity_logits = compacted(self._opacity_logits, kept)
         low, high = self._log_radius_bounds
-        self._log_radius_bounds = (thinned(low, kept), thinned(high, kept))
-        self._most_weight = thinned(self._most_weight, kept)
+        self._log_radius_bounds = (compacted(low, kept), compacted(high, kept))
+        self._most_weight = compacted(self._most_weight, kept)
         self._prior = None if self._prior is None else self._prior.thinned(kept)
         for moments in (self._moments.colors, self._moments.log_radii, self._moments.opacity_logits):
             moments.thin(kept)
