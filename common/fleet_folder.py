@@ -15,13 +15,18 @@ from vtslam.common.shm.errors import DamagedBlock, FleetExists, SharedMemoryErro
 from vtslam.common.shm.process_identity import boot_id, is_alive, own_identity
 from vtslam.common.topics import checked_name
 
-SHARED_MEMORY = Path("/dev/shm")
+_SHARED_MEMORY, _ELSEWHERE = Path("/dev/shm"), "VTSLAM_SHARED_MEMORY"
 _HEX = re.compile("[0-9a-f]{1,16}")
 _PREFIX = "vtslam-"
 _NEW_PREFIX = ".vtslam-new-"  # then the maker's identity
 _OWNER, _RING, _MAP, _JOURNAL, _FAILED, _ENDED = "owner", "ring", "map", "journal", "failed", "ended"
 _MAX_OWNER_BYTES = 65536
 _FAILURE_BYTES = 4096
+
+
+def shared_memory_folder() -> Path:
+    """Where fleets have their folders: VTSLAM_SHARED_MEMORY, a folder on a tmpfs with a short path; else /dev/shm."""
+    return Path(os.environ.get(_ELSEWHERE) or _SHARED_MEMORY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +62,7 @@ class FleetFolder:
         self.path = path
 
     @classmethod
-    def create(cls, fleet: str, *, run_folder: str = "", base: Path = SHARED_MEMORY) -> "FleetFolder":
+    def create(cls, fleet: str, *, run_folder: str = "", base: Path | None = None) -> "FleetFolder":
         """Make the folder of a new fleet, owned by this process, or take over that of a fleet that died.
 
         Blocks of a fleet that died stay, for the new one to go on with; :meth:`remove` first to begin anew.
@@ -66,6 +71,7 @@ class FleetFolder:
             FleetExists: A living fleet has that name, or another user's.
             ValueError: The name has other characters or lengths than allowed.
         """
+        base = base or shared_memory_folder()
         path = _path_of(fleet, base)
         owner = FleetOwner(fleet=fleet, boot=boot_id(), identity=own_identity(), run_folder=run_folder)
         new = base / f"{_NEW_PREFIX}{own_identity():x}-{fleet}"
@@ -85,9 +91,9 @@ class FleetFolder:
         return cls(path)
 
     @classmethod
-    def open(cls, fleet: str, *, base: Path = SHARED_MEMORY) -> "FleetFolder":
+    def open(cls, fleet: str, *, base: Path | None = None) -> "FleetFolder":
         """The folder of a fleet; raises SharedMemoryError if there is none of this user."""
-        path = _path_of(fleet, base)
+        path = _path_of(fleet, base or shared_memory_folder())
         _require_own(path)
         return cls(path)
 
@@ -173,10 +179,10 @@ def read_owner(path: Path) -> FleetOwner | None:
     return owner
 
 
-def running_fleets(*, base: Path = SHARED_MEMORY) -> list[str]:
+def running_fleets(*, base: Path | None = None) -> list[str]:
     """Names of this user's fleets whose owner lives."""
     names = []
-    for path in sorted(base.glob(f"{_PREFIX}*")):
+    for path in sorted((base or shared_memory_folder()).glob(f"{_PREFIX}*")):
         try:
             owner = read_owner(path) if _is_own(path) else None
         except DamagedBlock:
@@ -187,15 +193,16 @@ def running_fleets(*, base: Path = SHARED_MEMORY) -> list[str]:
 
 
 def sweep_dead_fleets(
-    *, base: Path = SHARED_MEMORY, keep: Callable[[FleetOwner], bool] = lambda owner: False
+    *, base: Path | None = None, keep: Callable[[FleetOwner], bool] = lambda owner: False
 ) -> list[str]:
     """Delete the folders of this user's fleets whose owner is dead; their names.
 
     Args:
-        base: Where fleets have their folders.
+        base: Where fleets have their folders, if not where they usually have.
         keep: Asked for each dead fleet; true where a run folder wants to go on with its blocks. Fleets of another boot
             and folders without a readable owner are not asked about: nothing can go on with them.
     """
+    base = base or shared_memory_folder()
     for path in base.glob(f"{_NEW_PREFIX}*"):
         maker = path.name.removeprefix(_NEW_PREFIX).partition("-")[0]
         if _is_own(path) and _HEX.fullmatch(maker) and not is_alive(int(maker, 16)):

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from vtslam.common import failpoints
-from vtslam.common.fleet_folder import SHARED_MEMORY
+from vtslam.common.fleet_folder import shared_memory_folder
 from vtslam.services.bench.supervisor_kill import seconds_after_supervisor_kill
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.run_plan import RunPlan
@@ -125,7 +125,7 @@ def bench_chaos(
         seed: Draws the plan of both.
         on_frame: Called after each frame of the second run.
     """
-    before = set(os.listdir(SHARED_MEMORY))
+    before = set(os.listdir(shared_memory_folder()))
     disturber = _Disturber(_events(len(plan.source), kills, hangs, seed), _points(seed), on_frame, random.Random(seed))
     with TemporaryDirectory(prefix="vtslam-chaos-") as folder:
         calm, disturbed = Path(folder, "calm"), Path(folder, "disturbed")
@@ -146,7 +146,7 @@ def bench_chaos(
         "identical": identical,
         "orphans": sum(Path(f"/proc/{pid}").exists() for pid in disturber.pids),
         "gone_after_supervisor_kill_s": None if gone_s is None else round(gone_s, 3),
-        "shm_left": len([name for name in set(os.listdir(SHARED_MEMORY)) - before if _is_ours(name)]),
+        "shm_left": len([name for name in set(os.listdir(shared_memory_folder())) - before if _is_ours(name)]),
     }
 
 

@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from vtslam.common.fleet_folder import SHARED_MEMORY, sweep_dead_fleets
+from vtslam.common.fleet_folder import shared_memory_folder, sweep_dead_fleets
 from vtslam.services.process_facts import children_of, is_gone
 from vtslam.services.run_plan import RunPlan
 from vtslam.services.supervisor.processes import PROCESSES
@@ -51,7 +51,7 @@ def _working_processes(fleet: "subprocess.Popen[bytes]") -> set[int]:
     deadline_s = time.monotonic() + _START_S
     while fleet.poll() is None and time.monotonic() < deadline_s:
         pids = children_of(fleet.pid)
-        if len(pids) == len(PROCESSES) and any(SHARED_MEMORY.glob(f"vtslam-run-{fleet.pid}-*/ring")):
+        if len(pids) == len(PROCESSES) and any(shared_memory_folder().glob(f"vtslam-run-{fleet.pid}-*/ring")):
             return pids
         time.sleep(_POLL_S)
     raise TimeoutError(f"the fleet did not start to work within {_START_S:g} s; status {fleet.poll()}")

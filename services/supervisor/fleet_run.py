@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vtslam.common.bus import Bus, Member
 from vtslam.common.bus_zenoh import Hub
-from vtslam.common.fleet_folder import SHARED_MEMORY, FleetFolder, sweep_dead_fleets
+from vtslam.common.fleet_folder import FleetFolder, sweep_dead_fleets
 from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
 from vtslam.services.frame_facts import FrameFacts
@@ -56,7 +56,7 @@ def run_in_fleet(
     *,
     resume: ResumePoint | None = None,
     fleet: str = "",
-    base: Path = SHARED_MEMORY,
+    base: Path | None = None,
     door: Door | None = None,
 ) -> RunSummary:
     """Run the source that ``run.toml`` names, each service a process of its own.
@@ -68,7 +68,7 @@ def run_in_fleet(
         hooks: What the caller is told and asked.
         resume: Where to go on; from the beginning if None.
         fleet: Name of the fleet; one of its own unless given.
-        base: Where the fleet's shared memory lies.
+        base: Where the fleet's shared memory lies, if not where it usually does.
         door: How it is opened to other hosts; closed unless given.
 
     Raises:

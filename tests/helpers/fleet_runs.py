@@ -10,6 +10,7 @@ from threading import Thread
 
 from helpers.recordings import ReplicaRecording, filled
 
+from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.network import Door
 from vtslam.services.run_plan import RunPlan, plan_run
 from vtslam.services.run_record import RunSummary
@@ -130,6 +131,20 @@ class Disturbance:
             if pid is not None and supervisor.children[wanted[1]].is_ready:
                 os.kill(pid, wanted[2])
                 self.signals.remove(wanted)
+
+
+class CutOff(Exception):
+    """Stands for the end of the process."""
+
+
+def cut_off_at(frame_id: int) -> Callable[[FrameFacts], None]:
+    """What to call after each frame, to end the run there."""
+
+    def on_frame(facts: FrameFacts) -> None:
+        if facts.frame_id == frame_id:
+            raise CutOff
+
+    return on_frame
 
 
 def fleet_run(

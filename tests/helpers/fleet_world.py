@@ -16,6 +16,7 @@ from vtslam.common.bus import Bus, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld
 from vtslam.common.bus_schedule import Kills, Schedule
 from vtslam.common.external_pose import ExternalPose
+from vtslam.common.fleet_folder import shared_memory_folder
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.messages import Command, Control
@@ -255,7 +256,7 @@ def run_world(
     schedule: Schedule, kills: Kills | None = None, *, stream: Stream | None = None
 ) -> tuple[Result, MemoryWorld]:
     """A whole run in a folder of its own; points within writes to shared memory count as points of the world."""
-    with tempfile.TemporaryDirectory(prefix="vts-", dir="/dev/shm") as name, pytest.MonkeyPatch.context() as patch:
+    with tempfile.TemporaryDirectory(dir=shared_memory_folder()) as name, pytest.MonkeyPatch.context() as patch:
         fleet = FleetWorld(Path(name), schedule, kills, stream=stream)
         patch.setattr(failpoints, "reach", fleet.world.point)
         try:

@@ -236,6 +236,9 @@ def main() -> None:
     else:
         names = ("shm.adopt.", "shm.active.", "shm.commit.", "shm.seal", "shm.remove.", "shm.commit.before_flip")
         go_on, check_end = _go_on_store, _check_store_end
+    with shared_folder() as folder:  # undisturbed; the sections made here need not be made again by what is forked
+        go_on(folder, Progress())
+        check_end(folder)
     if how == "points":
         print(json.dumps(_at_every_point(names, go_on, check_end)))
     else:

@@ -1,11 +1,11 @@
 """Small sections for the map store, every value of which follows from (section, frame); imports no engine."""
 
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
 from vtslam.common.external_pose import ExternalPose
+from vtslam.common.fleet_folder import shared_memory_folder
 from vtslam.common.frame import Frame
 from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.geometry.camera import Camera
@@ -35,7 +36,7 @@ MAX_GAUSSIANS = 30_000
 @contextmanager
 def shared_folder() -> Iterator[Path]:
     """A folder of this test's own in shared memory, deleted afterwards."""
-    path = Path(tempfile.mkdtemp(prefix="test-vtslam-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
+    path = Path(tempfile.mkdtemp(dir=shared_memory_folder()))
     try:
         yield path
     finally:
@@ -96,6 +97,7 @@ class SmallSection:
     rows: int = 50
     with_moments: bool = True
 
+    @lru_cache(maxsize=64)  # noqa: B019
     def section(self, frames: int) -> Section:
         count = frames * self.rows
         learned = numbers(1, self.section_id, frames)
@@ -129,6 +131,7 @@ class SmallSection:
     def neighbour_ids(self) -> tuple[int, ...]:
         return (self.section_id - 1,) if self.section_id else ()
 
+    @lru_cache(maxsize=64)  # noqa: B019
     def moments(self, frames: int) -> SectionMoments | None:
         if not self.with_moments:
             return None
@@ -150,6 +153,7 @@ class SmallSection:
             facts=self.facts(frames),
         )
 
+    @lru_cache(maxsize=64)  # noqa: B019
     def expected(self, frames: int) -> bytes:
         """:func:`state_bytes` of the state after ``frames`` frames."""
         return state_bytes(

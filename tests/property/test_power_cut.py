@@ -34,8 +34,8 @@ def recorded(path: Path, monkeypatch: pytest.MonkeyPatch) -> RecordingDisk:
     return disk
 
 
-def test_no_durable_section_is_ever_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, left = tmp_path / "run", tmp_path / "left"
+def test_no_durable_section_is_ever_lost(folder_in_memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, left = folder_in_memory / "run", folder_in_memory / "left"
     disk = recorded(path, monkeypatch)
     whole, rng, found = result_bytes(path), Random(1), set()
     assert len(disk.moments) > 60

@@ -9,6 +9,7 @@ from helpers.realtime_world import RealtimeResult, RealtimeWorld
 
 from vtslam.common import failpoints
 from vtslam.common.bus_schedule import Kills, NoKills, SeededKills, SeededSchedule
+from vtslam.common.fleet_folder import shared_memory_folder
 
 _SERVICES = ("sensor", "tracker", "mapper")
 _FRAMES, _SECTION = 80, 3
@@ -27,7 +28,7 @@ class _OneDeathEach:
 
 
 def realtime_run(seed: int, kills: Kills) -> RealtimeResult:
-    with tempfile.TemporaryDirectory(prefix="vts-", dir="/dev/shm") as name, pytest.MonkeyPatch.context() as patch:
+    with tempfile.TemporaryDirectory(dir=shared_memory_folder()) as name, pytest.MonkeyPatch.context() as patch:
         fleet = RealtimeWorld(
             Path(name), SeededSchedule(seed), settings_of(_SECTION), frames=_FRAMES, seconds=_SECONDS, kills=kills
         )

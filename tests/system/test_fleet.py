@@ -15,7 +15,7 @@ from helpers.shared_data import shared_data
 
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.process_facts import is_gone
-from vtslam.services.run_plan import plan_run
+from vtslam.services.run_plan import plan_resume, plan_run
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor import residency
 from vtslam.services.supervisor.errors import FleetError
@@ -75,13 +75,15 @@ def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRe
         urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60)
 
 
-@pytest.mark.parametrize("name", ["mapper", "tracker", "sensor"])
-def test_a_process_that_is_killed_twice_changes_nothing(name: str, small: SmallRecording, tmp_path: Path) -> None:
-    killed = Disturbance(signals=[(3, name, KILL), (SECTION + 3, name, KILL)])
+def test_processes_that_are_killed_twice_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
+    names = ("sensor", "tracker", "mapper")
+    moments = [*enumerate(names, 2), *enumerate(names, SECTION + 2)]
+    killed = Disturbance(signals=[(frames, name, KILL) for frames, name in moments])
     fleet_run(small.files, tmp_path / "run", killed)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert killed.deaths[name] == len(killed.events) == 2
+    assert killed.deaths == dict.fromkeys(names, 2)
+    assert len(killed.events) == len(moments)
     assert all("killed by signal 9" in event for event in killed.events)
     assert all(is_gone(pid) for pid in killed.pids)
 
@@ -168,7 +170,7 @@ def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording,
     assert stopped.events[0].startswith("tracker: left the bus while it ran after ")
 
 
-def test_a_process_that_cannot_live_ends_the_fleet(small: SmallRecording, tmp_path: Path) -> None:
+def test_a_process_that_cannot_live_ends_the_fleet_which_may_go_on_later(small: SmallRecording, tmp_path: Path) -> None:
     hopeless = Disturbance(failpoints={("mapper", start): "shm.adopt.before_epoch:1" for start in range(2, 9)})
     hopeless.failpoints["mapper", 1] = f"shm.commit.after_flip:{SECTION + 3}"  # committed, but nobody was told
     with pytest.raises(FleetError, match=f"mapper: killed by signal 9 after {SECTION + 2} frames, for the 6th time"):
@@ -177,15 +179,20 @@ def test_a_process_that_cannot_live_ends_the_fleet(small: SmallRecording, tmp_pa
     with RunFolder.open(tmp_path / "run") as run:
         facts, rows = run.read_info().facts, run.read_frames()
         assert run.section_ids() == [0]
+        assert run.catalog.num_frames == len(run.catalog.poses()[1]) == SECTION + 3
     assert (facts.finished, facts.interrupted, facts.frames, len(rows)) == (False, False, SECTION + 3, SECTION + 3)
     known = (tmp_path / "run" / "trajectory.txt").read_bytes()
     assert known.count(b"\n") == SECTION + 3
     assert small.undisturbed["trajectory.txt"].startswith(known)
     assert all(is_gone(pid) for pid in hopeless.pids)
     assert leftovers() == []
+    plan_resume(tmp_path / "run").resume(tmp_path / "run")
+    assert result_bytes(tmp_path / "run") == small.undisturbed
 
 
-def test_what_was_done_before_a_stop_is_kept(small: SmallRecording, tmp_path: Path) -> None:
+def test_what_was_done_before_a_stop_is_kept_and_its_short_section_mapped_again(
+    small: SmallRecording, tmp_path: Path
+) -> None:
     calm = Disturbance()
     summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames > SECTION)
 
@@ -199,6 +206,14 @@ def test_what_was_done_before_a_stop_is_kept(small: SmallRecording, tmp_path: Pa
     files = result_bytes(tmp_path / "run")
     assert files["000000.vts"] == small.undisturbed["000000.vts"]
     assert small.undisturbed["trajectory.txt"].startswith(files["trajectory.txt"])
+
+    assert summary.frames % SECTION
+    (tmp_path / "run" / "metrics.json").write_text("{}")
+    resumed = plan_resume(tmp_path / "run").resume(tmp_path / "run")
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert (resumed.frames, resumed.interrupted) == (FRAMES, False)
+    assert resumed.seconds > summary.seconds
+    assert not (tmp_path / "run" / "metrics.json").exists()
 
 
 def test_a_frame_that_cannot_be_read_ends_the_run_with_what_was_read(small: SmallRecording, tmp_path: Path) -> None:

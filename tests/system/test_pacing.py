@@ -5,10 +5,21 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
-from helpers.fleet_runs import ASSIGNMENTS, FRAMES, Disturbance, SmallRecording, result_bytes, small_plan
+from helpers.fleet_runs import (
+    ASSIGNMENTS,
+    FRAMES,
+    SECTION,
+    CutOff,
+    Disturbance,
+    SmallRecording,
+    cut_off_at,
+    result_bytes,
+    small_plan,
+)
 
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
+from vtslam.services.run_plan import plan_resume
 from vtslam.services.sensor.publisher import FramePublisher
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.fleet_run import FleetHooks
@@ -17,6 +28,7 @@ from vtslam.services.supervisor.supervisor import Supervisor
 from vtslam.storage.run_folder import RunFolder
 
 KILL = signal.SIGKILL
+PIPELINED = "fleet.pacing=pipelined"
 
 
 class Counts:
@@ -30,16 +42,38 @@ class Counts:
             self.found.update(child.counters)
 
 
-def test_a_pipelined_run_is_the_same_again_whoever_dies(small: SmallRecording, tmp_path: Path) -> None:
-    calm, killed = Disturbance(), Disturbance(signals=[(3, "tracker", KILL), (8, "mapper", KILL)])
-    plan = small_plan(small.files, "fleet.pacing=pipelined")
-    for name, disturbance in (("calm", calm), ("killed", killed)):
-        plan.execute_in_fleet(tmp_path / name, disturbance.hooks())
+@pytest.fixture(scope="module")
+def pipelined(small: SmallRecording, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What an undisturbed pipelined fleet leaves."""
+    run, calm = tmp_path_factory.mktemp("pipelined") / "run", Disturbance()
+    small_plan(small.files, PIPELINED).execute_in_fleet(run, calm.hooks())
+    assert (calm.frames, calm.events) == (FRAMES, [])
+    assert result_bytes(run) != small.undisturbed
+    return result_bytes(run)
 
-    assert calm.frames == killed.frames == FRAMES
+
+def test_a_pipelined_run_is_the_same_again_whoever_dies(
+    small: SmallRecording, pipelined: dict[str, bytes], tmp_path: Path
+) -> None:
+    killed = Disturbance(signals=[(3, "tracker", KILL), (8, "mapper", KILL)])
+    small_plan(small.files, PIPELINED).execute_in_fleet(tmp_path / "run", killed.hooks())
+
+    assert killed.frames == FRAMES
     assert sum(killed.deaths.values()) == 2
-    assert result_bytes(tmp_path / "killed") == result_bytes(tmp_path / "calm")
-    assert result_bytes(tmp_path / "calm") != small.undisturbed
+    assert result_bytes(tmp_path / "run") == pipelined
+
+
+def test_a_pipelined_fleet_goes_on_to_its_own_bytes(
+    small: SmallRecording, pipelined: dict[str, bytes], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    with pytest.raises(CutOff):
+        small_plan(small.files, PIPELINED).execute_in_fleet(run, FleetHooks(on_frame=cut_off_at(2 * SECTION + 2)))
+    done = RunFolder.open(run).catalog.num_frames
+    plan_resume(run).resume_in_fleet(run, Disturbance(frames=done).hooks())
+
+    assert done >= SECTION
+    assert result_bytes(run) == pipelined
 
 
 def test_in_realtime_frames_are_mapped_or_counted_as_dropped(small: SmallRecording, tmp_path: Path) -> None:

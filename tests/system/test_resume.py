@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -15,9 +14,10 @@ from helpers.fleet_runs import (
     ASSIGNMENTS,
     FRAMES,
     SECTION,
+    CutOff,
     Disturbance,
     SmallRecording,
-    fleet_run,
+    cut_off_at,
     result_bytes,
     small_plan,
 )
@@ -31,23 +31,9 @@ from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.process_facts import children_of
 from vtslam.services.run_plan import plan_resume
 from vtslam.services.sensor.sources.base import SourceError
-from vtslam.services.supervisor.errors import FleetError
-from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.storage import atomic
 from vtslam.storage.errors import ChecksumMismatch, RunFolderError, RunLocked, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
-
-
-class CutOff(Exception):
-    """Stands for the end of the process."""
-
-
-def cut_off_at(frame_id: int) -> Callable[[FrameFacts], None]:
-    def on_frame(facts: FrameFacts) -> None:
-        if facts.frame_id == frame_id:
-            raise CutOff
-
-    return on_frame
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -165,50 +151,11 @@ def test_a_run_that_publishers_fed_cannot_be_resumed(tmp_path: Path, capsys: pyt
     assert "publishers fed this run, and their frames are gone" in capsys.readouterr().err
 
 
-def test_a_pipelined_fleet_goes_on_to_its_own_bytes(small: SmallRecording, tmp_path: Path) -> None:
-    run, plan = tmp_path / "run", small_plan(small.files, "fleet.pacing='pipelined'")
-    plan.execute_in_fleet(tmp_path / "calm", Disturbance().hooks())
-    with pytest.raises(CutOff):
-        plan.execute_in_fleet(run, FleetHooks(on_frame=cut_off_at(2 * SECTION + 2)))
-    done = RunFolder.open(run).catalog.num_frames
-    plan_resume(run).resume_in_fleet(run, Disturbance(frames=done).hooks())
-
-    assert done >= SECTION
-    assert result_bytes(run) == result_bytes(tmp_path / "calm") != small.undisturbed
-
-
-def test_what_a_broken_fleet_had_mapped_is_known_and_mapped_again(small: SmallRecording, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    hopeless = Disturbance(failpoints={("mapper", start): "shm.adopt.before_epoch:1" for start in range(2, 9)})
-    hopeless.failpoints["mapper", 1] = f"shm.commit.after_flip:{SECTION + 3}"
-    with pytest.raises(FleetError):
-        fleet_run(small.files, run, hopeless)
-    assert RunFolder.open(run).catalog.num_frames == SECTION + 3
-    assert len(RunFolder.open(run).catalog.poses()[1]) == SECTION + 3
-    plan_resume(run).resume(run)
-
-    assert result_bytes(run) == small.undisturbed
-
-
 def test_a_run_that_dropped_frames_cannot_be_resumed(small: SmallRecording, tmp_path: Path) -> None:
     plan = small_plan(small.files, "fleet.pacing='realtime'")
     RunFolder.create(tmp_path / "run", plan._info(None)).close()
     with pytest.raises(RunFolderError, match="dropped frames to keep up with time; it cannot be resumed"):
         plan_resume(tmp_path / "run")
-
-
-def test_a_fleet_that_was_stopped_maps_its_short_section_again(small: SmallRecording, tmp_path: Path) -> None:
-    run, calm = tmp_path / "run", Disturbance()
-    stopped = fleet_run(small.files, run, calm, should_stop=lambda: calm.frames > SECTION)
-    assert stopped.interrupted
-    assert stopped.frames % SECTION
-    (run / "metrics.json").write_text("{}")
-    summary = plan_resume(run).resume(run)
-
-    assert result_bytes(run) == small.undisturbed
-    assert (summary.frames, summary.interrupted) == (FRAMES, False)
-    assert summary.seconds > stopped.seconds
-    assert not (run / "metrics.json").exists()
 
 
 def test_a_finished_run_is_left_as_it_is(small: SmallRecording, tmp_path: Path) -> None:

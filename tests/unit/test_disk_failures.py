@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -55,12 +56,13 @@ class FailingDisk(atomic.Disk):
 
 @pytest.mark.parametrize(("number", "kind"), [(errno.ENOSPC, DiskFull), (errno.EDQUOT, DiskFull), (errno.EROFS, None)])
 def test_a_disk_that_refuses_at_any_call_takes_nothing_away(
-    number: int, kind: type[WriteFailed] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: int, kind: type[WriteFailed] | None, folder_in_memory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls, refused = 0, True
-    whole = result_bytes(small_run(tmp_path / "whole", 3))
+    whole = result_bytes(small_run(folder_in_memory / "whole", 3))
+    begun = small_run(folder_in_memory / "begun", 1)
     while refused:
-        path = small_run(tmp_path / f"run{calls}", 1)
+        path = shutil.copytree(begun, folder_in_memory / f"run{calls}")
         with RunFolder.open(path, writable=True) as run:
             monkeypatch.setattr(atomic, "DISK", FailingDisk(calls, number))
             error = refused_by(partial(write_sections, run, 1, 3))

@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 from helpers.shm_sections import frame_of, spec_of
 
-from vtslam.common.fleet_folder import FleetFolder, FleetOwner, read_owner, sweep_dead_fleets
+from vtslam.common.fleet_folder import (
+    FleetFolder,
+    FleetOwner,
+    read_owner,
+    running_fleets,
+    shared_memory_folder,
+    sweep_dead_fleets,
+)
 from vtslam.common.shm.errors import FleetExists, SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingWriter
 from vtslam.common.shm.map_store import MapStore
@@ -98,6 +105,17 @@ def test_sweep_takes_dead_fleets_but_those_that_are_kept(tmp_path: Path) -> None
     assert sweep_dead_fleets(base=tmp_path, keep=keep) == ["damaged", "dead", "rebooted", "reused"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "vtslam-alive", "vtslam-kept"]
     assert asked == ["/runs/dead", "/runs/kept", "/runs/reused"]
+
+
+def test_fleets_lie_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VTSLAM_SHARED_MEMORY", str(tmp_path))
+    folder = FleetFolder.create("here")
+    assert folder.path == FleetFolder.open("here").path == tmp_path / "vtslam-here"
+    assert running_fleets() == ["here"]
+    _with_owner(folder, identity=_dead_identity())
+    assert sweep_dead_fleets() == ["here"]
+    monkeypatch.delenv("VTSLAM_SHARED_MEMORY")
+    assert shared_memory_folder() == Path("/dev/shm")
 
 
 def test_identities() -> None:

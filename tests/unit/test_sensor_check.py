@@ -74,7 +74,8 @@ def room() -> Source:
 
 @pytest.fixture(scope="module")
 def kitchen() -> Source:
-    return Kept(open_source(f"replica:{shared_data('redkitchen')}", size=(320, 240)))
+    """As much of it as shows every fault."""
+    return Kept(open_source(f"replica:{shared_data('redkitchen')}", size=(320, 240), frames=(0, 90)))
 
 
 def findings(source: Source) -> dict[str, CheckFinding]:
@@ -97,8 +98,8 @@ def test_names_the_fault_in_the_simulated_room(room: Source, fault: str) -> None
     assert faults(broken(room, fault)) == [next(name for name in NAMES if fault.startswith(name))]
 
 
-def test_redkitchen_is_sound(kitchen: Source) -> None:
-    assert faults(kitchen) == []
+def test_redkitchen_is_sound() -> None:
+    assert faults(open_source(f"replica:{shared_data('redkitchen')}", size=(320, 240))) == []
 
 
 @pytest.mark.parametrize("fault", NAMES)
@@ -107,7 +108,7 @@ def test_names_the_fault_in_redkitchen(kitchen: Source, fault: str) -> None:
 
 
 def test_says_how_far_color_was_shifted() -> None:
-    source = open_source(f"replica:{shared_data('redkitchen')}")
+    source = open_source(f"replica:{shared_data('redkitchen')}", frames=(0, 90))
     finding = findings(shifted_color(source, 12))["registration"]
     assert not finding.ok
     assert abs(finding.values["shift_right_px"] - 12.0) < 2.0
@@ -120,12 +121,16 @@ def test_says_how_far_color_was_shifted_to_the_left(kitchen: Source) -> None:
     assert abs(finding.values["shift_right_px"] + 6.0) < 1.0
 
 
-def test_finds_one_blank_frame_anywhere(kitchen: Source) -> None:
-    frame = kitchen.frame(217)
-    blank = replace(frame, rgb=np.full_like(frame.rgb, 200))
-    looks = planned_looks(len(kitchen))
-    frames = (blank if index == 217 else kitchen.frame(index) for index in looks.frames)
-    seen = {finding.name: finding for finding in examine(frames, looks, family="tum", truth=None)}
+def test_finds_one_blank_frame_anywhere(room: Source) -> None:
+    """In images of noise, where only this check has anything to say."""
+    rng, looks = np.random.default_rng(5), planned_looks(400)
+    small = room.frame(0).resized(40, 30)
+
+    def frame(index: int) -> Frame:
+        rgb = np.full_like(small.rgb, 200) if index == 217 else rng.integers(0, 256, small.rgb.shape, np.uint8)
+        return replace(small, frame_id=index, rgb=rgb)
+
+    seen = {finding.name: finding for finding in examine(map(frame, looks.frames), looks, family="tum", truth=None)}
     assert seen["blank frames"].found == "nothing to see in the colour of frame 217"
 
 
