@@ -148,7 +148,7 @@ def test_says_by_how_much_the_depth_scale_is_wrong(room: Source) -> None:
 
 def test_kitti_is_sound() -> None:
     """A part of it: its depth from stereo takes half a second a frame."""
-    source = open_source(f"kitti:{shared_data('kitti06_stereo')}?depth=stereo", frames=(0, 27))
+    source = open_source(f"kitti:{shared_data('kitti06_stereo')}?depth=stereo", frames=(0, 18))
     assert faults(source) == []
 
 
