@@ -2,6 +2,9 @@
 
 import ctypes
 
+_M_MMAP_THRESHOLD = -3  # of mallopt
+_LARGE_BYTES = 4 << 20
+
 
 def give_back_free_memory() -> None:
     """Let go of pages that hold nothing any more; does nothing where the C library is not glibc.
@@ -12,3 +15,14 @@ def give_back_free_memory() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+def keep_large_arrays_apart() -> None:
+    """Give each large array pages of its own from now on, which go back when it does; glibc only.
+
+    A section's arrays are replaced by slightly larger ones with every frame. In the heap, where glibc would soon put
+    them, each leaves a hole that no later one fits in. New pages cost a fourth of a millisecond per megabyte.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)

@@ -20,6 +20,7 @@ from vtslam.services.frame_facts import (
     frame_facts,
     untracked_state,
 )
+from vtslam.services.free_memory import give_back_free_memory, keep_large_arrays_apart
 from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunRecord, RunSummary
@@ -64,6 +65,7 @@ def run_recording(
         SourceError: A frame cannot be read; what was done before it is kept.
         StorageError: Something cannot be written.
     """
+    keep_large_arrays_apart()
     recorder = _Recorder(settings, engine, run, resume, recording)
     interrupted = False
     try:
@@ -152,6 +154,7 @@ class _Recorder:
         """Make the section that was written last part of the run."""
         assert self._archive.last is not None
         self._record.commit(self._archive.last, self._boundary())
+        give_back_free_memory()
 
     def _boundary(self) -> CommitFacts:
         """What the run goes on from after the last frame."""

@@ -81,12 +81,14 @@ def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
     from vtslam.common.config import load
     from vtslam.common.settings import Settings
     from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
+    from vtslam.services.free_memory import keep_large_arrays_apart
     from vtslam.services.sensor.sources.base import SourceError
     from vtslam.services.service_link import ServiceLink
     from vtslam.services.supervisor.processes import process_named
     from vtslam.storage.errors import StorageError
     from vtslam.storage.run_folder import RunFolder
 
+    keep_large_arrays_apart()
     owner = read_owner(folder.path)
     assert owner is not None
     run = RunFolder.open(Path(owner.run_folder))

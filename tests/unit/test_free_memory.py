@@ -2,7 +2,7 @@ import os
 
 import numpy as np
 
-from vtslam.services.free_memory import give_back_free_memory
+from vtslam.services.free_memory import give_back_free_memory, keep_large_arrays_apart
 from vtslam.services.process_facts import private_rss_mb
 
 
@@ -12,4 +12,13 @@ def test_holes_between_arrays_are_given_back() -> None:
     before_mb = private_rss_mb(os.getpid())
     give_back_free_memory()
     assert private_rss_mb(os.getpid()) < before_mb - 30.0
+    assert all(array[0] == 1 for array in arrays)
+
+
+def test_large_arrays_go_back_by_themselves() -> None:
+    keep_large_arrays_apart()
+    arrays = [np.ones(8 << 20, np.uint8) for _ in range(32)]
+    before_mb = private_rss_mb(os.getpid())
+    del arrays[::2]
+    assert private_rss_mb(os.getpid()) < before_mb - 100.0
     assert all(array[0] == 1 for array in arrays)

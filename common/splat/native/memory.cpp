@@ -4,6 +4,7 @@
 #include <sys/mman.h>
 
 #include <bit>
+#include <cstdint>
 #include <cstdlib>
 #include <mutex>
 #include <new>
@@ -15,11 +16,18 @@ namespace {
 constexpr std::size_t kHugePage = std::size_t(2) << 20;
 constexpr std::size_t kHeader = 64;  // holds the block's capacity, keeps the alignment
 constexpr std::size_t kKeptBytes = std::size_t(192) << 20;
+constexpr std::uint64_t kStale = 64;  // blocks taken since, some five renderings: the scene has other sizes now
+
+struct Kept {
+  void* block;
+  std::uint64_t since;  // blocks taken before it was given back
+};
 
 struct Cache {
   std::mutex mutex;
-  std::vector<void*> blocks;  // oldest first
+  std::vector<Kept> blocks;  // oldest first
   std::size_t bytes = 0;
+  std::uint64_t taken = 0;
 };
 
 Cache* cache = nullptr;
@@ -63,16 +71,17 @@ void* acquire_block(std::size_t bytes) {
   Cache& kept = the_cache();
   {
     const std::lock_guard lock(kept.mutex);
+    ++kept.taken;
     // A block somewhat too large does, so that a scene that grows leaves no trail of sizes behind.
     std::size_t best = kept.blocks.size();
     for (std::size_t i = 0; i < kept.blocks.size(); ++i) {
-      const std::size_t has = capacity_of(kept.blocks[i]);
+      const std::size_t has = capacity_of(kept.blocks[i].block);
       if (has >= capacity && has <= capacity + capacity / 4 &&
-          (best == kept.blocks.size() || has <= capacity_of(kept.blocks[best])))
+          (best == kept.blocks.size() || has <= capacity_of(kept.blocks[best].block)))
         best = i;
     }
     if (best < kept.blocks.size()) {
-      void* block = kept.blocks[best];
+      void* block = kept.blocks[best].block;
       kept.blocks.erase(kept.blocks.begin() + static_cast<std::ptrdiff_t>(best));
       kept.bytes -= capacity_of(block);
       return block;
@@ -93,15 +102,16 @@ void release_block(void* block) noexcept {
     return;
   }
   try {
-    kept.blocks.push_back(block);
+    kept.blocks.push_back({block, kept.taken});
   } catch (const std::bad_alloc&) {
     free_block(block);
     return;
   }
   kept.bytes += capacity;
-  while (kept.bytes > kKeptBytes) {
-    kept.bytes -= capacity_of(kept.blocks.front());
-    free_block(kept.blocks.front());
+  while (kept.bytes > kKeptBytes || kept.blocks.front().since + kStale < kept.taken) {
+    void* oldest = kept.blocks.front().block;
+    kept.bytes -= capacity_of(oldest);
+    free_block(oldest);
     kept.blocks.erase(kept.blocks.begin());
   }
 }
