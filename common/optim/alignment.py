@@ -157,14 +157,23 @@ def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _System:
+class LinearSystem:
+    """Normal equations of a left twist on ``T_observed_reference``.
+
+    Attributes:
+        H: float64 [6,6].
+        g: float64 [6].
+        mean_cost: Mean robust cost per measurement, in squared sigmas.
+        measured: Measurements, in pixels of the full image.
+    """
+
     H: npt.NDArray[np.float64]
     g: npt.NDArray[np.float64]
     mean_cost: float
     measured: int
 
 
-def _linearised(
+def linearised(
     reference: Reference,
     points: FloatImage,
     observed: Observed,
@@ -173,8 +182,19 @@ def _linearised(
     settings: GaussNewtonSettings,
     prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None,
     threads: int,
-) -> _System:
-    """H, g and cost at ``T``; the prior is (T_observed_reference it asks for, information)."""
+) -> LinearSystem:
+    """Both terms of one pyramid level, linearised.
+
+    Args:
+        reference: The rendered view.
+        points: float32 [M,6], those of its points that this level uses.
+        observed: The frame.
+        level: 0 is the finest.
+        T: ``T_observed_reference`` float64 [4,4].
+        settings: Noise model and weights.
+        prior: (``T_observed_reference`` it asks for, information [6,6]) or None.
+        threads: Threads of the kernel; the result does not depend on it.
+    """
     share = 4.0**level  # a pixel of a coarse level stands for so many pixels, and so does a point
     options = _align.AlignmentOptions(
         color_sigma=settings.color_sigma,
@@ -204,7 +224,7 @@ def _linearised(
         error = se3.log(T @ se3.inverse(prior[0]))
         H, g, cost = H + prior[1], g + prior[1] @ error, cost + 0.5 * float(error @ prior[1] @ error)
     measured = int((color_count + depth_count) * share)
-    return _System(H=H, g=g, mean_cost=cost / max(measured, 1), measured=measured)
+    return LinearSystem(H=H, g=g, mean_cost=cost / max(measured, 1), measured=measured)
 
 
 def align(
@@ -231,7 +251,7 @@ def align(
         threads: Threads of the kernel; the result does not depend on it.
     """
     T = T_observed_reference
-    system: _System | None = None
+    system: LinearSystem | None = None
     first = min(coarsest, len(reference.levels) - 1, len(observed.levels) - 1)
     for level in range(first, min(finest, first) - 1, -1):
         T, system = _solved_level(reference, observed, level, T, settings, prior, threads)
@@ -252,19 +272,19 @@ def _solved_level(
     settings: GaussNewtonSettings,
     prior: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None,
     threads: int,
-) -> tuple[npt.NDArray[np.float64], _System]:
+) -> tuple[npt.NDArray[np.float64], LinearSystem]:
     """Gauss-Newton on one level; a step that raises the mean cost is halved once, then ends the level."""
     points = np.ascontiguousarray(reference.points[:: 4**level])
-    system = _linearised(reference, points, observed, level, T, settings, prior, threads)
+    system = linearised(reference, points, observed, level, T, settings, prior, threads)
     for _ in range(settings.iterations):
         if system.measured < _MIN_MEASUREMENTS:
             break
         damped = system.H + _DAMPING * np.diag(np.diag(system.H)) + 1e-9 * np.eye(6)
         step = np.asarray(-np.linalg.solve(damped, system.g), np.float64)
-        trial = _linearised(reference, points, observed, level, se3.exp(step) @ T, settings, prior, threads)
+        trial = linearised(reference, points, observed, level, se3.exp(step) @ T, settings, prior, threads)
         if trial.mean_cost > system.mean_cost or trial.measured < _MIN_MEASUREMENTS:
             step = 0.5 * step
-            trial = _linearised(reference, points, observed, level, se3.exp(step) @ T, settings, prior, threads)
+            trial = linearised(reference, points, observed, level, se3.exp(step) @ T, settings, prior, threads)
             if trial.mean_cost > system.mean_cost or trial.measured < _MIN_MEASUREMENTS:
                 break
         T, system = se3.exp(step) @ T, trial

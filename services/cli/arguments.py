@@ -196,6 +196,11 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     system = kinds.add_parser("system", help="a whole run: time by stage, and quality")
     basin = kinds.add_parser("basin", help="how far off a first guess of the pose may be, for both optimisers")
     basin.add_argument("--trials", type=int, default=30, metavar="N", help="guesses per error (default: %(default)s)")
+    variants = kinds.add_parser("variants", help="ways to estimate a pose, compared on the same maps and guesses")
+    variants.add_argument(
+        "--trials", type=int, default=24, metavar="N", help="guesses per error (default: %(default)s)"
+    )
+    variants.add_argument("--only", default="", metavar="A,B", help="these of them (default: all)")
     codec = kinds.add_parser("codec", help="sections stored in each codec: bytes, quality lost, speed")
     codec.add_argument("--source", required=True, metavar="SOURCE", help=SOURCE_HELP)
     codec.add_argument("--curves", action="store_true", help="also coarser and finer grids of the dense codec")
@@ -231,13 +236,13 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     overlap = kinds.add_parser("overlap", help="choosing overlapping sections on a long road")
     overlap.add_argument("--views", type=int, default=100_000, metavar="N", help="along it (default: %(default)s)")
     overlap.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
-    for kind in (track, mapping, curves, system, basin, fleet):
+    for kind in (track, mapping, curves, system, basin, variants, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     _add_layers(city)
-    for kind in (track, mapping, curves, system, basin, codec, fleet, chaos):
+    for kind in (track, mapping, curves, system, basin, variants, codec, fleet, chaos):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, overlap, city, track, mapping, curves, system, basin, codec, fleet, chaos):
+    for kind in (splat, overlap, city, track, mapping, curves, system, basin, variants, codec, fleet, chaos):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

@@ -6,17 +6,19 @@ from pathlib import Path
 
 from vtslam.common.config import ConfigError
 from vtslam.common.preset_loading import load_settings
-from vtslam.services.bench.basin import ERRORS_M_DEG, bench_basin
+from vtslam.services.bench.basin import bench_basin
 from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.city import CityDrive, bench_city
 from vtslam.services.bench.codec import bench_codec, steps
 from vtslam.services.bench.codec_picture import write_codec_picture
 from vtslam.services.bench.comparison import comparison_table, read_result, surroundings
+from vtslam.services.bench.first_guesses import ERRORS_M_DEG
 from vtslam.services.bench.fleet import PARTS, FleetBench, bench_fleet
 from vtslam.services.bench.map_curves import MOST_SCHEDULES, bench_map_curves, write_map_picture
 from vtslam.services.bench.overlap import HEADS, bench_overlap
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.splat import bench_splat
+from vtslam.services.bench.variants import bench_variants
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.run_command import assignments_of
 from vtslam.services.run_plan import RunPlan, plan_run
@@ -50,6 +52,7 @@ def _measured(args: Namespace) -> dict[str, object]:
         "city": _city,
         "fleet": _fleet,
         "overlap": _overlap,
+        "variants": _variants,
     }
     return kinds.get(args.bench, _recording)(args)
 
@@ -77,6 +80,14 @@ def _basin(args: Namespace) -> dict[str, object]:
     plan = _plan(args)
     with Progress(2 * len(ERRORS_M_DEG) * args.trials, what="tracking", unit="guess") as progress:
         return bench_basin(plan, trials=args.trials, on_step=progress.step)
+
+
+def _variants(args: Namespace) -> dict[str, object]:
+    if args.trials < 0:
+        raise ConfigError(f"bench variants: expected --trials of at least 0, found {args.trials}")
+    plan, only = _plan(args), [name for name in args.only.split(",") if name]
+    with Progress(len(plan.source), what="comparing", unit="frame") as progress:
+        return bench_variants(plan, trials=args.trials, only=only, on_step=progress.step)
 
 
 def _curves(args: Namespace) -> dict[str, object]:

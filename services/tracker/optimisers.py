@@ -190,7 +190,7 @@ class _GaussNewton:
     ) -> PoseEstimate:
         s = self._settings
         masked_depth = np.where(mask > 0, self._depth_m, np.float32(0))
-        levels = _pyramid_levels(s.levels, self._camera)
+        levels = pyramid_levels(s.levels, self._camera)
         observed = observed_frame(self._rgb, masked_depth, self._camera, levels)
         target = Target(rgb=self._rgb, depth_m=self._depth_m, mask=mask)
         T, information, first, loss, spent = T_guess, np.zeros((6, 6)), None, None, 0
@@ -230,7 +230,7 @@ class _GaussNewton:
             T = se3.orthonormalized(alignment.T_observed_reference @ T)
             information = alignment.information
             step = se3.log(alignment.T_observed_reference)
-            if finest == 0 and _is_small(step, s):
+            if finest == 0 and is_small_step(step, s):
                 break
         assert first is not None
         assert loss is not None
@@ -246,7 +246,7 @@ class _GaussNewton:
         return self._prior.T_camera_map @ se3.inverse(T_camera_map), self._prior.information
 
 
-def _is_small(step: npt.NDArray[np.float64], settings: GaussNewtonSettings) -> bool:
+def is_small_step(step: npt.NDArray[np.float64], settings: GaussNewtonSettings) -> bool:
     """Whether a view from the pose before the step is as good as one from the pose after it."""
     return bool(
         np.linalg.norm(step[:3]) < _SMALL_STEP * settings.converged_m
@@ -254,7 +254,7 @@ def _is_small(step: npt.NDArray[np.float64], settings: GaussNewtonSettings) -> b
     )
 
 
-def _pyramid_levels(wanted: int, camera: Camera) -> int:
+def pyramid_levels(wanted: int, camera: Camera) -> int:
     """Levels whose images have at least ``_COARSEST_SIDE_PX`` rows and columns; one at least."""
     side = min(camera.width, camera.height)
     return max(1, min(wanted, (side // _COARSEST_SIDE_PX).bit_length()))

@@ -111,6 +111,33 @@ def test_a_basin_needs_frames_to_map_and_to_track(tmp_path: Path, capsys: pytest
     assert "expected at least 6 frames, found 5" in capsys.readouterr().err
 
 
+def test_variants_are_compared_on_the_same_frames_and_guesses(tmp_path: Path) -> None:
+    few = ["--only", "forward,inverse,opencv_previous", "--trials", "2"]
+    values = bench("variants", "sim:room?frames=8", "--size", "80x60", *few, result=tmp_path / "variants.json")
+    assert (values["tracked"], values["trials"]) == (4, 2)
+    assert set(values) == {"bench", "tracked", "trials", "gaussians", "forward", "inverse", "opencv_previous", "about"}
+    for name, arithmetic in (("forward", "product"), ("inverse", "numpy")):
+        row = values[name]
+        assert 0 < row["translation_median_mm"] <= row["translation_p95_mm"] < 10
+        assert 0 < row["rotation_median_deg"] <= row["rotation_p95_deg"] < 0.5
+        assert list(row["found"]) == ["1 cm, 0.5 deg", "2 cm, 1 deg", "5 cm, 2.5 deg", "10 cm, 5 deg"]
+        assert row["found_share"] >= 0.75
+        assert 1 <= row["full_size_renders"] == row["renders"] <= 3
+        assert row["arithmetic"] == arithmetic
+    odometry = values["opencv_previous"]
+    assert (odometry["found_share"], odometry["found"], odometry["renders"]) == (None, {}, 0)
+    assert odometry["translation_median_mm"] < 10
+
+
+def test_variants_that_there_are_not_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    room = ["bench", "variants", "sim:room?frames=6", "--size", "64x48"]
+    assert main([*room, "--only", "forward,sideways"]) == 2
+    assert "found sideways" in capsys.readouterr().err
+    assert main(["bench", "variants", "sim:room?frames=5", "--size", "64x48"]) == 2
+    assert "expected at least 6 frames, found 5" in capsys.readouterr().err
+    assert main([*room, "--trials", "-1"]) == 2
+
+
 def test_map_is_done_at_the_true_poses(tmp_path: Path) -> None:
     values = bench("map", *SMALL, result=tmp_path / "map.json")
     assert values["renders_per_frame"]["track"] == 0
