@@ -145,7 +145,11 @@ class _View:
     def of(cls, rendering: Rendering, threshold: float) -> "_View":
         alpha = rendering.alpha.astype(np.float64)
         inverse = np.where(alpha > threshold, 1.0 / np.maximum(alpha, 1e-3), 0.0)
-        return cls(rgb=rendering.rgb * inverse[..., None], depth_m=rendering.depth_m * inverse, inverse_alpha=inverse)
+        return cls(
+            rgb=rendering.rgb.astype(np.float64) * inverse[..., None],
+            depth_m=rendering.depth_m.astype(np.float64) * inverse,
+            inverse_alpha=inverse,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
