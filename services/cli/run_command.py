@@ -42,8 +42,8 @@ def _checked_out(args: Namespace) -> Path:
         raise ConfigError("run: expected SOURCE and --out RUN, or --resume RUN")
     if args.resume is not None and (args.source or args.out or args.overwrite or args.config or assignments_of(args)):
         raise ConfigError(
-            f"run: --resume {args.resume} goes on with the run's own source and settings; it takes --in-process and "
-            "--json only"
+            f"run: --resume {args.resume} goes on with the run's own source and settings, and a run that records goes "
+            "on recording; it takes --in-process and --json only"
         )
     assert out is not None
     return out

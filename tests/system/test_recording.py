@@ -10,14 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.cli_runs import DEADLINE_S, POLL_S, start_vtslam
-from helpers.fleet_runs import ASSIGNMENTS, FRAMES, Disturbance, SmallRecording, result_bytes, small_plan
+from helpers.fleet_runs import (
+    ASSIGNMENTS,
+    FRAMES,
+    SECTION,
+    CutOff,
+    Disturbance,
+    SmallRecording,
+    cut_off_at,
+    result_bytes,
+    small_plan,
+)
 from helpers.mcap_bytes import BagWriter
 from helpers.shared_data import shared_data
 
 from vtslam.common.fleet_folder import running_fleets
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
-from vtslam.services.run_plan import plan_run
+from vtslam.services.run_plan import plan_resume, plan_run
 from vtslam.services.sensor.sources.base import SourceUri
 from vtslam.services.sensor.sources.mcap_recording import open_mcap
 from vtslam.services.sensor.sources.registry import open_source
@@ -68,6 +78,29 @@ def test_a_recorder_that_dies_goes_on_in_another_part(small: SmallRecording, tmp
     last = second.frame(len(second) - 1)
     np.testing.assert_array_equal(last.rgb, plain.frame(FRAMES - 1).rgb)
     assert len(second) <= FRAMES - 8
+
+
+@pytest.mark.parametrize("in_process", [True, False])
+def test_a_run_that_is_resumed_goes_on_recording(in_process: bool, small: SmallRecording, tmp_path: Path) -> None:
+    run, durable = tmp_path / "run", 2 * SECTION
+    with pytest.raises(CutOff):
+        small_plan(small.files, f'recorder.file="{tmp_path / "x.mcap"}"').execute(run, on_frame=cut_off_at(durable + 1))
+    plan = plan_resume(run)
+    if in_process:
+        plan.resume(run)
+    else:
+        plan.resume_in_fleet(run, Disturbance(frames=durable).hooks())
+    assert result_bytes(run) == small.undisturbed
+    _assert_plays(tmp_path / "x.mcap", small, durable + 2)
+    rest = tmp_path / "x-2.mcap"
+    _assert_plays(rest, small)
+    assert len(open_source(f"mcap:{rest}")) == FRAMES - durable
+    pose_at = open_mcap(SourceUri.parse(f"mcap:{rest}")).poses("/tf")
+    last = read_trajectory(run / "trajectory.txt")
+    assert pose_at is not None
+    found = pose_at(int(last.capture_times_ns[-1]))
+    assert found is not None
+    np.testing.assert_allclose(found, last.poses[-1], atol=1e-12)
 
 
 def test_a_running_fleet_is_recorded(small: SmallRecording, tmp_path: Path) -> None:
