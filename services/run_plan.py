@@ -76,7 +76,7 @@ class RunPlan:
         """
         make_way(self.settings.recorder, overwrite=overwrite)
         with (
-            RunFolder.create(folder, self._info(created_by), overwrite=overwrite) as run,
+            RunFolder.create(folder, self.info(created_by), overwrite=overwrite) as run,
             maybe_recording(self.settings.recorder, family=self.family) as recording,
         ):
             return run_recording(
@@ -147,10 +147,11 @@ class RunPlan:
         from vtslam.services.supervisor.fleet_run import run_in_fleet
 
         make_way(self.settings.recorder, overwrite=overwrite)
-        with RunFolder.create(folder, self._info(None), overwrite=overwrite) as run:
+        with RunFolder.create(folder, self.info(), overwrite=overwrite) as run:
             return run_in_fleet(run, self.settings, hooks)
 
-    def _info(self, created_by: str | None) -> RunInfo:
+    def info(self, created_by: str | None = None) -> RunInfo:
+        """What ``run.toml`` says at the start; ``created_by`` is this program and its version if None."""
         facts = RunFacts(
             created_by=created_by or f"vtslam {program_version()}",
             source=self.source.uri,

@@ -132,7 +132,7 @@ def bench_chaos(
         plan.execute(calm)
         plan.execute_in_fleet(disturbed, disturber.hooks())
         counts = _frame_counts(disturbed)
-        identical = _result_bytes(calm) == _result_bytes(disturbed)
+        identical = result_bytes(calm) == result_bytes(disturbed)
         gone_s = seconds_after_supervisor_kill(plan, Path(folder))
     sent_kills = {name: disturber.sent[name, signal.SIGKILL] for name in _SERVICES}
     killed = {name: child.deaths - child.hangs for name, child in disturber.children.items()}
@@ -180,7 +180,8 @@ def _points(seed: int) -> dict[tuple[str, int], str]:
     }
 
 
-def _result_bytes(run: Path) -> dict[str, bytes]:
+def result_bytes(run: Path) -> dict[str, bytes]:
+    """The files of a run that must not depend on how it was run, by name."""
     paths = [run / "trajectory.txt", *sorted((run / "sections").glob("*.vts"))]
     return {path.name: path.read_bytes() for path in paths}
 

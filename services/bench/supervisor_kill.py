@@ -31,7 +31,7 @@ def seconds_after_supervisor_kill(plan: RunPlan, folder: Path) -> float | None:
         [sys.executable, "-m", "vtslam.services.cli", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
-        pids = _working_processes(fleet)
+        pids = working_processes(fleet)
     finally:
         fleet.kill()
         start_s = time.monotonic()
@@ -46,7 +46,7 @@ def seconds_after_supervisor_kill(plan: RunPlan, folder: Path) -> float | None:
         sweep_dead_fleets()
 
 
-def _working_processes(fleet: "subprocess.Popen[bytes]") -> set[int]:
+def working_processes(fleet: "subprocess.Popen[bytes]") -> set[int]:
     """The processes of a fleet once the first frame is in its ring."""
     deadline_s = time.monotonic() + _START_S
     while fleet.poll() is None and time.monotonic() < deadline_s:

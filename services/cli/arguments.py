@@ -226,6 +226,12 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     chaos.add_argument(
         "source", nargs="?", default="sim:room?frames=120&size=160x120", metavar="SOURCE", help="default: %(default)s"
     )
+    resume = kinds.add_parser("resume", help="a fleet killed as a whole, and resumed, N times: is the result the same?")
+    resume.add_argument("--kills", type=int, default=10, metavar="N", help="kills (default: %(default)s)")
+    resume.add_argument("--seed", type=int, default=1, metavar="S", help="draws them (default: %(default)s)")
+    resume.add_argument(
+        "source", nargs="?", default="sim:room?frames=300&size=64x48", metavar="SOURCE", help="default: %(default)s"
+    )
     city = kinds.add_parser("city", help="a long drive through the simulated town as a fleet: does anything grow?")
     city.add_argument("--frames", type=int, metavar="N", help="the first N (default: the whole drive)")
     city.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
@@ -239,10 +245,10 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     for kind in (track, mapping, curves, system, basin, variants, fleet):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     _add_layers(city)
-    for kind in (track, mapping, curves, system, basin, variants, codec, fleet, chaos):
+    for kind in (track, mapping, curves, system, basin, variants, codec, fleet, chaos, resume):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, overlap, city, track, mapping, curves, system, basin, variants, codec, fleet, chaos):
+    for kind in (splat, overlap, city, track, mapping, curves, system, basin, variants, codec, fleet, chaos, resume):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 

@@ -17,6 +17,7 @@ from vtslam.services.bench.fleet import PARTS, FleetBench, bench_fleet
 from vtslam.services.bench.map_curves import MOST_SCHEDULES, bench_map_curves, write_map_picture
 from vtslam.services.bench.overlap import HEADS, bench_overlap
 from vtslam.services.bench.recording import bench_map, bench_system, bench_track
+from vtslam.services.bench.resume import bench_resume, is_whole
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.bench.variants import bench_variants
 from vtslam.services.cli.console import Console, Progress
@@ -39,7 +40,14 @@ def bench_command(args: Namespace) -> int:
     console.print(comparison_table(values, earlier))
     about = surroundings(["vtslam", *sys.argv[1:]])
     console.result({"bench": args.bench, **values, "about": about})
-    return 0 if args.bench != "chaos" or is_sound(values) else 1
+    return 0 if _is_good(args, values) else 1
+
+
+def _is_good(args: Namespace, values: dict[str, object]) -> bool:
+    """Whether what was tried, rather than measured, went well."""
+    if args.bench == "resume":
+        return is_whole(values, kills=args.kills)
+    return args.bench != "chaos" or is_sound(values)
 
 
 def _measured(args: Namespace) -> dict[str, object]:
@@ -53,6 +61,7 @@ def _measured(args: Namespace) -> dict[str, object]:
         "fleet": _fleet,
         "overlap": _overlap,
         "variants": _variants,
+        "resume": _resume,
     }
     return kinds.get(args.bench, _recording)(args)
 
@@ -128,6 +137,14 @@ def _chaos(args: Namespace) -> dict[str, object]:
         return bench_chaos(
             plan, kills=args.kills, hangs=args.hangs, seed=args.seed, on_frame=lambda facts: progress.step()
         )
+
+
+def _resume(args: Namespace) -> dict[str, object]:
+    if args.kills < 0:
+        raise ConfigError(f"bench resume: expected --kills of at least 0, found {args.kills}")
+    plan = _plan(args)
+    with Progress(args.kills, what="killing and resuming", unit="kill") as progress:
+        return bench_resume(plan, kills=args.kills, seed=args.seed, on_kill=progress.step)
 
 
 def _fleet(args: Namespace) -> dict[str, object]:

@@ -10,6 +10,7 @@ from helpers.fleet_runs import SmallRecording, small_plan
 
 from vtslam.services.bench.chaos import bench_chaos, is_sound
 from vtslam.services.bench.comparison import comparison_table, flat
+from vtslam.services.bench.resume import bench_resume, is_whole
 from vtslam.services.bench.splat import yardstick_scene
 from vtslam.services.cli.__main__ import main
 
@@ -191,6 +192,17 @@ def test_a_fleet_under_fire_loses_nothing(small: SmallRecording) -> None:
     assert is_sound(values)
     assert values["kills"] >= 3  # the sensor may have finished before its turn
     assert values["kills_in_shm_write"] >= 1
+
+
+def test_a_fleet_killed_as_a_whole_and_resumed_gives_the_same(small: SmallRecording) -> None:
+    told: list[None] = []
+    values = bench_resume(small_plan(small.files), kills=2, seed=3, on_kill=lambda: told.append(None))
+
+    assert is_whole(values, kills=2)
+    assert values == {"frames": 20, "kills": 2, "identical": True, "sections": 4, "sections_verified": 4}
+    assert len(told) == 2
+    assert not is_whole({**values, "sections_verified": 3}, kills=2)
+    assert not is_whole({**values, "identical": False}, kills=2)
 
 
 def test_codec_reports_bytes_quality_and_speed(tmp_path: Path) -> None:

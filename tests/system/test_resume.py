@@ -154,7 +154,7 @@ def test_a_run_that_publishers_fed_cannot_be_resumed(tmp_path: Path, capsys: pyt
 
 def test_a_run_that_dropped_frames_cannot_be_resumed(small: SmallRecording, tmp_path: Path) -> None:
     plan = small_plan(small.files, "fleet.pacing='realtime'")
-    RunFolder.create(tmp_path / "run", plan._info(None)).close()
+    RunFolder.create(tmp_path / "run", plan.info()).close()
     with pytest.raises(RunFolderError, match="dropped frames to keep up with time; it cannot be resumed"):
         plan_resume(tmp_path / "run")
 
