@@ -4,15 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.fleet_runs import ASSIGNMENTS, Disturbance, SmallRecording, result_bytes
+from helpers.fleet_runs import ASSIGNMENTS, Disturbance, SmallRecording, result_bytes, small_plan
+from helpers.fleet_runs import FRAMES as FRAMES_OF_RECORDING
 from helpers.mcap_bytes import BagWriter
 
 from vtslam.common.config import ConfigError
 from vtslam.common.trajectory_io import read_trajectory, write_trajectory
 from vtslam.services.cli.__main__ import main
+from vtslam.services.evaluation import evaluate_run
 from vtslam.services.recorded_run import RecordedRun
 from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.storage.run_folder import RunFolder
 
 FRAMES = 8
 
@@ -31,6 +34,11 @@ def _words(*assignments: str) -> list[str]:
     return [word for text in (*ASSIGNMENTS, f"source.frames=0:{FRAMES}", *assignments) for word in ("--set", text)]
 
 
+def _number(value: object) -> float:
+    assert isinstance(value, float)
+    return value
+
+
 def _states(run: Path) -> list[str]:
     return [str(row["state"]) for row in RecordedRun(run).rows]
 
@@ -44,6 +52,31 @@ def test_given_poses_take_the_place_of_tracking(small: SmallRecording, poses: Pa
     np.testing.assert_allclose(found.poses, given.poses[:FRAMES], atol=1e-12)
     for name in ("one", "many"):
         assert _states(tmp_path / name) == ["first", *["known"] * (FRAMES - 1)]
+
+
+def test_the_poses_of_tracking_given_back_make_the_same_map(small: SmallRecording, tmp_path: Path) -> None:
+    small_plan(small.files).execute(tmp_path / "tracked")
+    given = tmp_path / "tracked" / "trajectory.txt"
+    words = ["--poses", str(given), "--tracking", "off", "--in-process", "--out", str(tmp_path / "given")]
+    assert main(["run", small.files.uri, *words, *_words(f"source.frames=0:{FRAMES_OF_RECORDING}")]) == 0
+    tracked, mapped = (RunFolder.open(tmp_path / name) for name in ("tracked", "given"))
+    assert tracked.section_ids() == mapped.section_ids()
+    for section_id in tracked.section_ids():
+        before, after = tracked.read_section(section_id), mapped.read_section(section_id)
+        for name, column in before.columns().items():
+            if column.dtype.kind == "f":
+                np.testing.assert_allclose(after.columns()[name], column, atol=1e-3, err_msg=name)
+            else:
+                np.testing.assert_array_equal(after.columns()[name], column, err_msg=name)
+
+
+def test_true_poses_make_no_worse_a_map_than_tracking(small: SmallRecording, poses: Path, tmp_path: Path) -> None:
+    small_plan(small.files).execute(tmp_path / "tracked")
+    words = ["--poses", str(poses), "--tracking", "off", "--in-process", "--out", str(tmp_path / "given")]
+    assert main(["run", small.files.uri, *words, *_words(f"source.frames=0:{FRAMES_OF_RECORDING}")]) == 0
+    tracked, given = (evaluate_run(RecordedRun(tmp_path / name)) for name in ("tracked", "given"))
+    for figure in ("psnr_paper_db", "psnr_heldout_db"):
+        assert _number(given[figure]) > _number(tracked[figure]) - 0.02
 
 
 def test_given_poses_guide_tracking(small: SmallRecording, poses: Path, tmp_path: Path) -> None:
