@@ -62,11 +62,13 @@ class SectionSettings:
     """How the stream is cut into sections.
 
     Attributes:
-        length: Frames of a section, N.
+        length: Frames of a section, N; the most it has if length_m ends it.
+        length_m: A section also ends once its frames have travelled so far, metres; 0 for any distance.
         candidate_interval: Every so many frames one answers overlap questions, N_1.
     """
 
     length: Annotated[int, Range(2, 10000)] = 30
+    length_m: NonNegative = 0.0
     candidate_interval: PositiveCount = 5
 
 

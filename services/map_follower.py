@@ -10,6 +10,7 @@ from vtslam.common.frame import Frame
 from vtslam.common.overlap.coarse import CoarseDepth
 from vtslam.common.overlap.view_index import ViewFacts
 from vtslam.common.section import Section
+from vtslam.common.section_end import poses_in
 from vtslam.common.shm.active_reader import ActiveReader, PinnedActive
 from vtslam.common.shm.errors import GenerationGone, SectionNotResident
 from vtslam.common.shm.map_store import MapStore
@@ -85,6 +86,7 @@ class MapFollower:
         map: The map; the active section's arrays are the store's own, and valid until the next :meth:`go_to`.
         facts: What was committed last, beside the map; None before the first commit.
         frame: The frame committed last, in place; None before the first commit.
+        poses: ``T_section_frame`` float64 [4,4] of the active section's frames up to then.
     """
 
     def __init__(self, store: MapStore, archive: ReadsSections, *, candidate_interval: int) -> None:
@@ -92,6 +94,7 @@ class MapFollower:
         self.map = SectionMap(archive, candidate_interval=candidate_interval)
         self.facts: CommitFacts | None = None
         self.frame: Frame | None = None
+        self.poses: tuple[npt.NDArray[np.float64], ...] = ()
         self._reader: tuple[int, ActiveReader] | None = None
         self._held: PinnedActive | None = None
         self._seen = (-1, -1)  # section and generation of the last commit; of a sealed section, the next one and 0
@@ -106,6 +109,11 @@ class MapFollower:
     def active_id(self) -> int | None:
         """The section that was committed to last, if it is not sealed."""
         return self._seen[0] if self._seen[1] > 0 else None
+
+    @property
+    def section_id(self) -> int:
+        """The section that was committed to last, or the next one if that is sealed."""
+        return max(self._seen[0], 0)
 
     def refresh(self) -> None:
         """Go on to the last commit, and the map to it."""
@@ -159,6 +167,7 @@ class MapFollower:
         try:
             # Images are written once and stay where they are: no pin is needed to look at them.
             self.facts, self.frame = CommitFacts.unpacked(held.state.facts), held.state.frames[-1]
+            self.poses = tuple(pose.copy() for pose in poses_in(held.state.section))
             self._seen = section_id, held.state.generation
         finally:
             held.release()
@@ -173,7 +182,7 @@ class MapFollower:
         if last is None or not last.is_sealed:
             return
         self.map.sealed(self._archive.read(last.section_id))
-        self.facts, self.frame = CommitFacts.unpacked(last.facts), last.frame
+        self.facts, self.frame, self.poses = CommitFacts.unpacked(last.facts), last.frame, ()
         self.release()
         self._seen = self._at = last.section_id + 1, 0
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 from vtslam.common.frame import Frame
+from vtslam.common.section_end import section_is_full
+from vtslam.common.settings import SectionSettings
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.sensor.sources.base import Source
 from vtslam.storage.catalog_rows import STORED, SectionRow
@@ -26,7 +28,7 @@ class ResumePoint:
     frame: Frame
 
 
-def prepare_to_resume(run: RunFolder, source: Source, *, section_length: int) -> ResumePoint | None:
+def prepare_to_resume(run: RunFolder, source: Source, *, section: SectionSettings) -> ResumePoint | None:
     """Bring a run folder to the end of its last durable full section.
 
     A shorter last section, which a run leaves that was asked to stop, is dropped unless the recording ends with it:
@@ -35,7 +37,7 @@ def prepare_to_resume(run: RunFolder, source: Source, *, section_length: int) ->
     Args:
         run: The run folder, open for writing.
         source: Its recording.
-        section_length: Frames of a section.
+        section: How long sections are.
 
     Returns:
         Where to go on; None for the beginning.
@@ -46,10 +48,12 @@ def prepare_to_resume(run: RunFolder, source: Source, *, section_length: int) ->
     """
     last: SectionRow | None = None
     for row in run.catalog.sections():
-        is_short = row.num_frames < section_length and row.end_frame_id < len(source)
-        if row.state != STORED or is_short:
+        is_short = row.num_frames < section.length and row.end_frame_id < len(source)
+        if row.state != STORED or (is_short and section.length_m == 0.0):
             break
         require_intact(run, row)
+        if is_short and not section_is_full(tuple(run.read_section(row.section_id).T_section_frame), section):
+            break
         last = row
     run.drop_sections(0 if last is None else last.section_id + 1)
     run.remove_derived()

@@ -133,7 +133,7 @@ class RunPlan:
         return point is not None and point.facts.num_frames == len(self.source)
 
     def _prepared(self, run: RunFolder) -> ResumePoint | None:
-        point = prepare_to_resume(run, self.source, section_length=self.settings.section.length)
+        point = prepare_to_resume(run, self.source, section=self.settings.section)
         done = 0 if point is None else point.facts.num_frames
         run.catalog.add_event("resumed", f"after {done} frames, by vtslam {program_version()}")
         return point

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.section import Section
+from vtslam.common.section_end import poses_in, section_is_full
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.mapper.state import ActiveSection, CommitRecord
@@ -82,7 +83,7 @@ class System:
         self._tracker = Tracker(settings=settings.tracker, engine=engine, threads=threads)
         self._mapper = MapperTurns(settings, engine, self.map)
         self._state = TrackerState()
-        self._frames = 0
+        self._frames = self._num_sections = 0  # sections: those sealed
 
     @property
     def state(self) -> TrackerState:
@@ -92,9 +93,8 @@ class System:
     def go_on_after(self, section_id: int, *, num_frames: int, state: TrackerState) -> None:
         """Begin at the end of a sealed section, with the tracker's state there, instead of at the first frame."""
         assert self._frames == 0
-        assert num_frames == (section_id + 1) * self.settings.section.length
         self.map.sealed(self._archive.read(section_id))
-        self._frames, self._state = num_frames, state
+        self._frames, self._num_sections, self._state = num_frames, section_id + 1, state
 
     def process(
         self,
@@ -108,7 +108,7 @@ class System:
             frame: The frame; a pose prior that comes with it is weighed by its covariance.
             known_T_world_camera: float64 [4,4], its pose if that is known: it is mapped there, not tracked.
         """
-        section_id, row = divmod(self._frames, self.settings.section.length)
+        section_id, row = self._num_sections, 0 if self.active is None else len(self.active.section.frames)
         tracking, start_s, budget_s = None, self._clock(), self.settings.mapper.budget_s
         if known_T_world_camera is None and self._tracker.tracks(frame, is_first=self._frames == 0):
             tracking = self._tracker.track(
@@ -132,7 +132,8 @@ class System:
             frame, commit.T_world_camera, tracking, mean_depth_m(frame), exposure=commit.exposure
         )
         self._frames += 1
-        sealed = self._seal() if row == self.settings.section.length - 1 else None
+        is_full = section_is_full(poses_in(self.active.section), self.settings.section)
+        sealed = self._seal() if is_full else None
         return FrameReport(
             frame=frame,
             tracking=tracking,
@@ -151,5 +152,6 @@ class System:
         section, renders = self._mapper.seal(self.active)
         self._archive.write(section)
         self.active = None
+        self._num_sections += 1
         self.map.sealed(section)
         return Seal(section_id=section.section_id, gaussians=section.gaussians.count, renders=renders)

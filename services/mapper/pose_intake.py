@@ -15,8 +15,15 @@ class PoseIntake(Protocol):
         """Whether a pose need not be mapped."""
         ...
 
-    def listen(self, num_frames: int, sequence: int) -> None:
-        """Take in what has come; ``num_frames`` are committed, the last one of ``sequence`` in the ring."""
+    def listen(self, num_frames: int, sequence: int, *, section_id: int, row: int) -> None:
+        """Take in what has come.
+
+        Args:
+            num_frames: Committed up to now.
+            sequence: Of the last one, in the ring.
+            section_id: Of the next one.
+            row: Of the next one, in that section.
+        """
         ...
 
     def take(self, num_frames: int) -> TrackedPose | None:
@@ -41,7 +48,7 @@ class EveryPose:
         self._tracked = bus.subscriber(TRACKER_POSE)
         self._poses: dict[int, TrackedPose] = {}
 
-    def listen(self, num_frames: int, sequence: int) -> None:
+    def listen(self, num_frames: int, sequence: int, *, section_id: int, row: int) -> None:
         """See `PoseIntake`."""
         while (tracked := self._tracked.receive()) is not None:
             if tracked.message.frame_id >= num_frames:
@@ -63,25 +70,26 @@ class NewestPose:
 
     Args:
         bus: The mapper's session.
-        section_length: Frames of a section.
     """
 
     may_skip = True
 
-    def __init__(self, bus: Bus, *, section_length: int) -> None:
+    def __init__(self, bus: Bus) -> None:
         # Not newest-only: a mapper that starts again gets the pose that came before, which may be the only one.
         self._tracked = bus.subscriber(TRACKER_POSE)
-        self._section_length = section_length
         self._newest: TrackedPose | None = None
         self._ended = False
 
-    def listen(self, num_frames: int, sequence: int) -> None:
+    def listen(self, num_frames: int, sequence: int, *, section_id: int, row: int) -> None:
         """See `PoseIntake`."""
         while (tracked := self._tracked.receive()) is not None:
             if self._newest is None or tracked.message.slot_sequence > self._newest.slot_sequence:
                 self._newest = tracked.message
         newest = self._newest
-        if newest is not None and (newest.slot_sequence <= sequence or not self._fits(newest, num_frames)):
+        if newest is None:
+            return
+        fits = newest.section_id == section_id and newest.generation >= num_frames - row + min(row, 1)
+        if newest.slot_sequence <= sequence or not fits:
             self._newest = None
 
     def take(self, num_frames: int) -> TrackedPose | None:
@@ -94,7 +102,3 @@ class NewestPose:
         if through_frame_id is not None and self._newest is None:
             self._ended = True  # poses that come later are not mapped
         return self._ended
-
-    def _fits(self, pose: TrackedPose, num_frames: int) -> bool:
-        section_id, row = divmod(num_frames, self._section_length)
-        return pose.section_id == section_id and pose.generation >= num_frames - row + min(row, 1)

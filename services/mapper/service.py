@@ -8,6 +8,7 @@ from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.messages import FrameCommitted, SectionSealed, ServiceState, TrackedPose
 from vtslam.common.section import Section
+from vtslam.common.section_end import poses_in, section_is_full
 from vtslam.common.settings import Settings
 from vtslam.common.shm.active_writer import ActiveWriter
 from vtslam.common.shm.errors import FrameGone, MapStoreFull, SharedMemoryFull
@@ -85,13 +86,13 @@ class MapperService:
         self._map = SectionMap(archive, candidate_interval=settings.section.candidate_interval)
         self._turns = MapperTurns(settings, engine, self._map)
         self._journal = JournalWriter(paths.journal)
-        length = settings.section.length
-        self._intake: PoseIntake = NewestPose(bus, section_length=length) if pace.is_realtime else EveryPose(bus)
+        self._intake: PoseIntake = NewestPose(bus) if pace.is_realtime else EveryPose(bus)
         self._committed = bus.publisher(MAPPER_COMMITTED)
         self._sealed = bus.publisher(SECTION_SEALED)
         self._ring: FrameRingReader | None = None
         self._active: ActiveSection | None = None
         self._facts: CommitFacts | None = None
+        self._last_row = 0  # of the last commit, in its section
         self._writer: ActiveWriter | None = None
         self._mapped: _Mapped | None = None
         self._untold: CommitFacts | None = None  # committed, but there was no room in the journal
@@ -102,7 +103,9 @@ class MapperService:
     def step(self) -> float | None:
         """See `Steps`."""
         self._link.poll()
-        self._intake.listen(self._num_frames, 0 if self._facts is None else self._facts.sequence)
+        section_id, row = self._place()
+        sequence = 0 if self._facts is None else self._facts.sequence
+        self._intake.listen(self._num_frames, sequence, section_id=section_id, row=row)
         if self._link.stopping:
             self._end()
             return None
@@ -128,6 +131,12 @@ class MapperService:
         """Frames committed."""
         return 0 if self._facts is None else self._facts.num_frames
 
+    def _place(self) -> tuple[int, int]:
+        """Section of the next frame, and its row there."""
+        if self._active is not None:
+            return self._active.section.section_id, len(self._active.section.frames)
+        return 0 if self._facts is None else self._facts.frame.facts.section_id + 1, 0
+
     @property
     def _last_frame_id(self) -> int:
         return -1 if self._facts is None else self._facts.frame.facts.frame_id
@@ -140,7 +149,7 @@ class MapperService:
         return self._intake.is_drained(self._num_frames, self._link.drain_through)
 
     def _section_ends(self, active: ActiveSection) -> bool:
-        return len(active.section.frames) == self._settings.section.length or self._is_drained()
+        return section_is_full(poses_in(active.section), self._settings.section) or self._is_drained()
 
     # --- taking over ------------------------------------------------------------------------------------------------
 
@@ -150,10 +159,13 @@ class MapperService:
         state = None if self._writer is None else self._writer.state()
         if state is not None:
             self._active = active_section_of(state, self._settings.mapper)
+            self._last_row = len(self._active.section.frames) - 1
             self._map.committed(self._active.section)
             self._facts = CommitFacts.unpacked(state.facts)
         elif (last := self._store.last_commit()) is not None:
-            self._map.sealed(self._archive.read(last.section_id))
+            section = self._archive.read(last.section_id)
+            self._map.sealed(section)
+            self._last_row = len(section.frames) - 1
             self._facts = CommitFacts.unpacked(last.facts)
         if self._facts is not None and not (self._active is not None and self._section_ends(self._active)):
             self._announce(self._facts)
@@ -173,7 +185,7 @@ class MapperService:
 
     def _map_frame(self, frame: Frame, pose: TrackedPose) -> _Mapped:
         start_ns = self._clock.monotonic_ns()
-        section_id, row = divmod(self._num_frames, self._settings.section.length)
+        section_id, row = self._place()
         budget_s = self._settings.mapper.budget_s
         active, record = self._turns.map(
             frame,
@@ -225,6 +237,7 @@ class MapperService:
             return self._wait_for_room(error)
         self._no_room_since_ns = self._mapped = None
         self._active, self._facts = mapped.active, mapped.facts
+        self._last_row = len(mapped.active.section.frames) - 1
         self._map.committed(mapped.active.section)
         self._link.count("frames.committed")
         return 0.0 if self._section_ends(mapped.active) else self._announce(mapped.facts)
@@ -310,7 +323,7 @@ class MapperService:
                 frame_id=about.frame_id,
                 capture_time_ns=frame.capture_time_ns,
                 section_id=about.section_id,
-                frame_index=(facts.num_frames - 1) % self._settings.section.length,
+                frame_index=self._last_row,
                 T_world_camera=frame.T_world_camera,
                 exposure=facts.exposure,
                 gaussians_added=about.gaussians_added,

@@ -142,12 +142,12 @@ def _tracker(parts: _Parts) -> "Steps":
         _archive(parts, store),
         candidate_interval=settings.section.candidate_interval,
     )
-    splat, length = with_threads(settings.splat, settings.fleet.tracker_threads), settings.section.length
+    splat = with_threads(settings.splat, settings.fleet.tracker_threads)
     core = Tracker(settings=settings.tracker, engine=make_engine(splat), threads=thread_count(splat))
     bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
     if pace.is_realtime:
-        return RealtimeTracker(bus, link, core, follower, ring_path, section_length=length)
-    return TrackerService(bus, link, core, follower, ring_path, section_length=length, lead=pace.lead)
+        return RealtimeTracker(bus, link, core, follower, ring_path)
+    return TrackerService(bus, link, core, follower, ring_path, section=settings.section, lead=pace.lead)
 
 
 def _mapper(parts: _Parts) -> "Steps":

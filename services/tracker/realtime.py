@@ -40,7 +40,6 @@ class RealtimeTracker:
         tracker: The core.
         follower: The map.
         ring_path: Where the frame ring is, or will be.
-        section_length: Frames of a section.
     """
 
     def __init__(
@@ -50,11 +49,9 @@ class RealtimeTracker:
         tracker: Tracker,
         follower: MapFollower,
         ring_path: Path,
-        *,
-        section_length: int,
     ) -> None:
         self._clock, self._link, self._tracker, self._follower = bus.clock, link, tracker, follower
-        self._ring_path, self._section_length = ring_path, section_length
+        self._ring_path = ring_path
         self._ring: FrameRingReader | None = None
         self._descriptors = Descriptors(bus, link)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
@@ -103,7 +100,7 @@ class RealtimeTracker:
         held, descriptor = pinned
         start_ns, frame = self._clock.monotonic_ns(), held.frame
         active_id, num_frames = self._follower.active_id, self._follower.num_frames
-        section_id = num_frames // self._section_length if active_id is None else active_id
+        section_id = self._follower.section_id
         state, result = self._remembered(), None
         if self._tracker.tracks(frame, is_first=num_frames == 0):
             result = self._tracker.track(

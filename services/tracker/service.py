@@ -3,9 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.messages import ServiceState
+from vtslam.common.section_end import section_is_full
+from vtslam.common.settings import SectionSettings
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.shm.ring_layout import FrameDescriptor
@@ -35,7 +40,7 @@ class TrackerService:
         tracker: The core.
         follower: The map; the store keeps ``lead`` generations besides the last.
         ring_path: Where the frame ring is, or will be.
-        section_length: Frames of a section.
+        section: How long sections are.
         lead: Frames that tracking may be ahead of mapping.
     """
 
@@ -47,17 +52,19 @@ class TrackerService:
         follower: MapFollower,
         ring_path: Path,
         *,
-        section_length: int,
+        section: SectionSettings,
         lead: int = 0,
     ) -> None:
         self._clock, self._link, self._tracker, self._follower = bus.clock, link, tracker, follower
-        self._ring_path, self._section_length, self._lead = ring_path, section_length, lead
+        self._ring_path, self._section, self._lead = ring_path, section, lead
         self._ring: FrameRingReader | None = None
         self._descriptors = Descriptors(bus, link)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
         self._poses = PosePublisher(bus, link)
         self._proposed = -1  # the last frame a pose was published of
+        self._proposed_head = False  # whether it was a head
         self._ahead = TrackerState()  # what is remembered after it
+        self._poses_ahead: dict[int, npt.NDArray[np.float64]] = {}  # T_section_frame by frame, of those not committed
 
     def step(self) -> float | None:
         """See `Steps`."""
@@ -70,7 +77,7 @@ class TrackerService:
             self._link.tell(ServiceState.FINISHED, self._proposed)
             return None
         if self._track_next():
-            if self._proposed % self._section_length == 0:  # what was compared to find the head's pose is gone
+            if self._proposed_head:  # what was compared to find the head's pose is gone
                 give_back_free_memory()
             self._link.tell(ServiceState.WORKING, self._proposed)
             return 0.0
@@ -81,9 +88,10 @@ class TrackerService:
         """Track the first frame that is neither committed nor proposed; false if that cannot be yet."""
         self._follower.look()
         frame_id = max(self._follower.num_frames, self._proposed + 1)
-        section_id, row = divmod(frame_id, self._section_length)
-        if not self._map_is_there(frame_id, section_id, row):
-            return False
+        poses = self._poses_before(frame_id)
+        section_id, row = self._follower.section_id, len(poses)
+        if section_is_full(poses, self._section) or not self._map_is_there(frame_id, section_id, row):
+            return False  # a full section is sealed before its successor's head is tracked
         descriptor = self._descriptor_of(frame_id)
         if descriptor is None or self._ring is None:
             return False
@@ -108,8 +116,14 @@ class TrackerService:
             track_s=1e-9 * (self._clock.monotonic_ns() - start_ns),
         )
         self._link.count("frames.tracked")
-        self._proposed = frame_id
+        self._proposed, self._proposed_head = frame_id, row == 0
         return True
+
+    def _poses_before(self, frame_id: int) -> tuple[npt.NDArray[np.float64], ...]:
+        """``T_section_frame`` of the frames before this one in the section that goes on: committed, then proposed."""
+        num_frames = self._follower.num_frames
+        self._poses_ahead = {each: pose for each, pose in self._poses_ahead.items() if each >= num_frames}
+        return (*self._follower.poses, *(self._poses_ahead[each] for each in range(num_frames, frame_id)))
 
     def _generation(self, row: int) -> int:
         """Frames of its section that a frame is tracked against."""
@@ -149,6 +163,8 @@ class TrackerService:
         after = state.after(frame, T_world_camera, result, mean_depth_m(frame))
         active = self._follower.map.active
         if active is None or active.section_id != section_id:
+            self._poses_ahead[frame.frame_id] = np.eye(4)  # a head
             return after
-        T_world_camera = active.T_world_section @ active.T_section_camera(T_world_camera)
+        self._poses_ahead[frame.frame_id] = T_section_camera = active.T_section_camera(T_world_camera)
+        T_world_camera = active.T_world_section @ T_section_camera
         return replace(after, committed_poses=(*after.committed_poses[:-1], T_world_camera))

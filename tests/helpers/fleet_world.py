@@ -41,12 +41,13 @@ FRAMES, SIZE = 5, (20, 15)
 TIMEOUT_S = 600.0  # simulated
 
 
-def settings_of(section_length: int) -> Settings:
+def settings_of(section_length: int, *, length_m: float = 0.0) -> Settings:
     """Of a small map."""
     return load_settings(
         preset="fast",
         assignments=[
             f"section.length={section_length}",
+            f"section.length_m={length_m}",
             "section.candidate_interval=1",
             "mapper.iterations_head=2",
             "mapper.iterations_regular=1",
@@ -235,7 +236,7 @@ class FleetWorld:
             core,
             follower,
             self._folder / "ring",
-            section_length=self._settings.section.length,
+            section=self._settings.section,
             lead=self._pace.lead,
         )
 

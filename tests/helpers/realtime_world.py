@@ -175,10 +175,10 @@ class RealtimeWorld:
         return ReplaySensor(bus, link, self._source, self._folder / "ring", rate_hz=RATE_HZ)
 
     def _tracker(self, bus: Bus, link: ServiceLink) -> Steps:
-        interval, length = self._settings.section.candidate_interval, self._settings.section.length
+        interval = self._settings.section.candidate_interval
         follower = MapFollower(self._store, StoreArchive(self._store, Sections()), candidate_interval=interval)
         core = Tracker(settings=self._settings.tracker, engine=ENGINE, threads=1)
-        return RealtimeTracker(bus, link, core, follower, self._folder / "ring", section_length=length)
+        return RealtimeTracker(bus, link, core, follower, self._folder / "ring")
 
     def _mapper(self, bus: Bus, link: ServiceLink) -> Steps:
         return MapperService(

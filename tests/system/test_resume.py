@@ -159,6 +159,27 @@ def test_a_run_that_dropped_frames_cannot_be_resumed(small: SmallRecording, tmp_
         plan_resume(tmp_path / "run")
 
 
+def test_sections_that_ended_after_a_distance_are_kept_and_cut_off_ones_are_not(
+    small: SmallRecording, tmp_path: Path
+) -> None:
+    calm, run = tmp_path / "calm", tmp_path / "run"
+    plan = small_plan(small.files, "section.length_m=0.06")
+    plan.execute(calm)
+    lengths = [row.num_frames for row in RunFolder.open(calm).catalog.sections()]
+    assert min(lengths[:-1]) < SECTION
+    durable = sum(lengths[:-2])
+    seen: list[int] = []
+    stopped = plan.execute(
+        run, on_frame=lambda facts: seen.append(facts.frame_id), should_stop=lambda: len(seen) > durable
+    )
+    assert (stopped.interrupted, stopped.frames) == (True, durable + 1)
+    again = Disturbance(frames=durable)
+    plan_resume(run).resume_in_fleet(run, again.hooks())
+
+    assert result_bytes(run) == result_bytes(calm) != small.undisturbed
+    assert again.frames == FRAMES
+
+
 def test_a_finished_run_is_left_as_it_is(small: SmallRecording, tmp_path: Path) -> None:
     run = tmp_path / "run"
     first = small_plan(small.files).execute(run)
