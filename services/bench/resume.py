@@ -33,7 +33,8 @@ def bench_resume(plan: RunPlan, *, kills: int, seed: int, on_kill: Callable[[], 
     Args:
         plan: The run; its fleets are lockstep ones.
         kills: SIGKILLs of a whole fleet, supervisor and services at once.
-        seed: Draws the moments: a number of durable sections, and a part of the time that a section takes.
+        seed: Draws the moments: a number of durable sections, each once as far as there are enough, and a part of the
+            section that follows.
         on_kill: Called after each of them.
 
     Returns:
@@ -42,17 +43,18 @@ def bench_resume(plan: RunPlan, *, kills: int, seed: int, on_kill: Callable[[], 
 
     Raises:
         FleetError: A fleet ended by itself and not well.
-        TimeoutError: A fleet does not get on, or does not die.
+        TimeoutError: A fleet does not start to work, or does not die.
     """
     rng = random.Random(seed)
     with TemporaryDirectory(prefix="vtslam-resume-") as folder:
         calm, killed, log = Path(folder, "calm"), Path(folder, "killed"), Path(folder, "log")
         undisturbed = plan.execute(calm)
         RunFolder.create(killed, plan.info()).close()
-        met = 0
-        for durable in sorted(rng.randrange(max(undisturbed.sections - 1, 1)) for _ in range(kills)):
+        ends, met = _ends_of_sections(calm), 0
+        for section_id in _moments(rng, kills, sections=len(ends)):
+            within = (0, *ends)[section_id : section_id + 2]
             delay_s = rng.uniform(0.0, undisturbed.seconds / undisturbed.sections)
-            met += _killed(killed, log, frames=durable * plan.settings.section.length, delay_s=delay_s)
+            met += _killed(killed, log, frames=(within[0], within[1]), delay_s=delay_s)
             on_kill()
         _finish(killed, log)
         sweep_dead_fleets()
@@ -73,6 +75,19 @@ def is_whole(values: dict[str, Any], *, kills: int) -> bool:
     return values["identical"] is True and verified and values["kills"] == kills
 
 
+def _ends_of_sections(path: Path) -> list[int]:
+    with RunFolder.open(path) as run:
+        return [row.end_frame_id for row in run.catalog.sections()]
+
+
+def _moments(rng: random.Random, kills: int, *, sections: int) -> list[int]:
+    """Sections that are being mapped when a fleet is killed, rising; the last one would be over too soon."""
+    choices = range(max(sections - 1, 1))
+    if kills <= len(choices):
+        return sorted(rng.sample(choices, kills))
+    return sorted(rng.choices(choices, k=kills))
+
+
 def _resumed(run: Path, log: Path) -> "subprocess.Popen[bytes]":
     """A fleet that goes on with the run."""
     words = [sys.executable, "-m", "vtslam.services.cli", "run", "--resume", str(run)]
@@ -80,14 +95,21 @@ def _resumed(run: Path, log: Path) -> "subprocess.Popen[bytes]":
         return subprocess.Popen(words, stdout=output, stderr=subprocess.STDOUT)
 
 
-def _killed(run: Path, log: Path, *, frames: int, delay_s: float) -> bool:
-    """Resume the run, and kill everything some time after so many frames are durable; whether it was still at work."""
+def _killed(run: Path, log: Path, *, frames: tuple[int, int], delay_s: float) -> bool:
+    """Resume the run, and kill everything; whether it was still at work.
+
+    Args:
+        run: The run folder.
+        log: What the fleet says.
+        frames: The kill waits until so many are durable, and then ...
+        delay_s: ... so long, or until the second number is.
+    """
     fleet = _resumed(run, log)
     pids: set[int] = set()
     try:
-        pids = working_processes(fleet)
-        _wait_until_durable(run, frames, fleet)
-        time.sleep(delay_s)
+        pids = _working(fleet)
+        _wait_until_durable(run, frames[0], fleet, patience_s=_SECTION_S)
+        _wait_until_durable(run, frames[1], fleet, patience_s=delay_s)
     finally:
         at_work = fleet.poll() is None
         for pid in (fleet.pid, *pids) if at_work else ():
@@ -104,17 +126,27 @@ def _kill(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-def _wait_until_durable(run: Path, frames: int, fleet: "subprocess.Popen[bytes]") -> None:
-    deadline_s, found = time.monotonic() + _SECTION_S, -1
-    while fleet.poll() is None:
+def _working(fleet: "subprocess.Popen[bytes]") -> set[int]:
+    """The fleet's processes once they work; none if there was nothing left to do."""
+    try:
+        return working_processes(fleet)
+    except TimeoutError:
+        if fleet.poll() is None:
+            raise
+        return set()
+
+
+def _wait_until_durable(run: Path, frames: int, fleet: "subprocess.Popen[bytes]", *, patience_s: float) -> None:
+    """Until so many frames are durable, the fleet has ended, or for so long no section became durable."""
+    deadline_s, found = time.monotonic() + patience_s, -1
+    while fleet.poll() is None and time.monotonic() < deadline_s:
         with RunFolder.open(run) as folder:
             durable = folder.catalog.num_frames
         if durable >= frames:
             return
-        if durable > found:
-            deadline_s, found = time.monotonic() + _SECTION_S, durable
-        elif time.monotonic() > deadline_s:
-            raise TimeoutError(f"the fleet has made no section durable for {_SECTION_S:g} s; {durable} frames are")
+        if found >= 0 and durable > found:
+            deadline_s = time.monotonic() + patience_s
+        found = durable
         time.sleep(_POLL_S)
 
 
