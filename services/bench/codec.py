@@ -22,7 +22,7 @@ from vtslam.storage.section_convert import section_of
 from vtslam.storage.section_file import column_bytes, decode_section, encode_section
 from vtslam.storage.section_record import SectionRecord
 
-RATE_WEIGHT, RATE_COARSENESS = 0.05, 1.4  # of `dense_rate`; the weight unless the settings have one
+RATE_WEIGHT, RATE_COARSENESS = 0.05, 1.4  # of `dense_rate`; unless the settings have a weight; times storage.coarseness
 OTHER_FORMATS = {"ply_3dgs": 248, "splatam_14_floats": 56, "vtgaussian_released": 64}  # bytes per Gaussian, raw
 _HOLDOUT, _EVALUATED_INTERVAL = 8, 5
 _CURVE_FACTORS = (0.6, 1.0, 1.6, 2.5)
@@ -57,7 +57,8 @@ def bench_codec(plan: RunPlan, *, curves: bool, on_step: Callable[[], None] = la
     """Map the recording without and with a rate term, and store both maps.
 
     Args:
-        plan: The recording and settings. Without ``holdout`` every 8th regular frame is held out.
+        plan: The recording and settings. Without ``holdout`` every 8th regular frame is held out. ``dense`` is on the
+            usual grid, ``dense_rate`` on one 1.4 times as coarse as ``storage.coarseness``.
         curves: Also measure ``dense`` on coarser and finer grids.
         on_step: Called after each of the 2 runs and each map stored and looked at.
 
@@ -74,7 +75,8 @@ def bench_codec(plan: RunPlan, *, curves: bool, on_step: Callable[[], None] = la
         recording = _recording_bytes(plan.source)
         reference = _quality(plain, lambda record: record)
         found: dict[str, object] = {}
-        coarser = DenseGrid().coarser(RATE_COARSENESS)
+        coarseness = RATE_COARSENESS * plan.settings.storage.coarseness
+        coarser = DenseGrid().coarser(coarseness)
         stored: tuple[tuple[str, RecordedRun, SectionCodec, DenseGrid | None], ...] = (
             ("lossless", plain, "lossless", None),
             ("fast", plain, "fast", None),
@@ -91,7 +93,7 @@ def bench_codec(plan: RunPlan, *, curves: bool, on_step: Callable[[], None] = la
             }
     settings = {
         "rate_weight": weight,
-        "rate_coarseness": RATE_COARSENESS,
+        "rate_coarseness": coarseness,
         "bytes_per_gaussian_of_others": OTHER_FORMATS,
         "recording_bytes": recording,
     }

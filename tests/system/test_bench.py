@@ -9,6 +9,7 @@ import pytest
 from helpers.fleet_runs import SmallRecording, small_plan
 
 from vtslam.services.bench.chaos import bench_chaos, is_sound
+from vtslam.services.bench.codec import RATE_COARSENESS
 from vtslam.services.bench.comparison import comparison_table, flat
 from vtslam.services.bench.resume import bench_resume, is_whole
 from vtslam.services.bench.splat import yardstick_scene
@@ -218,6 +219,7 @@ def test_codec_reports_bytes_quality_and_speed(tmp_path: Path) -> None:
         assert values[codec]["encode_mb_s"] > 0
         assert values[codec]["decode_mb_s"] > 0
         assert values[codec]["file_bytes_per_gaussian"] > values[codec]["bytes_per_gaussian"]
+    assert values["rate_coarseness"] == RATE_COARSENESS
     curve = values["curves"]["dense"]
     assert [point["bytes_per_gaussian"] for point in curve] == sorted(
         (point["bytes_per_gaussian"] for point in curve), reverse=True
