@@ -299,10 +299,15 @@ class Catalog:
 
     # --- events -----------------------------------------------------------------------------------------------------
 
-    def add_event(self, kind: str, text: str) -> None:
-        """Note that something happened now."""
+    def add_event(self, kind: str, text: str, *, time_ns: int | None = None) -> None:
+        """Note that something happened: now, or at ``time_ns`` (Unix time), unless the same is noted already."""
+        values = (time.time_ns() if time_ns is None else time_ns, kind, text)
         with self._transaction() as db:
-            db.execute("INSERT INTO events (time_ns, kind, text) VALUES (?,?,?)", (time.time_ns(), kind, text))
+            db.execute(
+                "INSERT INTO events (time_ns, kind, text) SELECT ?1, ?2, ?3 "
+                "WHERE NOT EXISTS (SELECT 1 FROM events WHERE time_ns = ?1 AND kind = ?2 AND text = ?3)",
+                values,
+            )
 
     def events(self) -> list[Event]:
         """What happened, in order."""
