@@ -8,8 +8,8 @@ import signal
 
 VARIABLE = "VTSLAM_FAILPOINT"
 
-# One at each boundary of the steps in docs/protocol-shm.md, sections 4 to 6, in the order of the steps; those of the run
-# folder at the boundaries of docs/format-run.md, section 1.
+# One at each boundary of the steps in docs/protocol-shm.md, sections 4 to 6, in the order of the steps; then those of
+# docs/format-run.md, section 1.
 NAMES = (
     "shm.ring.before_claim",
     "shm.ring.after_claim",

@@ -16,7 +16,6 @@ from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.section_map import ReadsSections, SectionMap
 
-
 _LOADS = 3  # a section that was loaded may leave again before it is pinned
 
 

@@ -1,6 +1,5 @@
 """A fleet of processes leaves what one process leaves, whichever of them dies and whenever."""
 
-import re
 import signal
 import socket
 from pathlib import Path
@@ -17,7 +16,6 @@ from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.base import SourceError
-from vtslam.services.supervisor import residency
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.run_folder import RunFolder
 
@@ -32,7 +30,7 @@ def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_
     assert result_bytes(tmp_path / "run") == small.undisturbed
     assert (summary.frames, summary.sections, summary.interrupted) == (FRAMES, 4, False)
     assert calm.events == []
-    assert len(calm.pids) == 3
+    assert len(calm.pids) == 4
     assert all(is_gone(pid) for pid in calm.pids)
     with RunFolder.open(tmp_path / "run") as run:
         assert run.read_info().facts.finished
@@ -75,7 +73,7 @@ def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRe
         urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60)
 
 
-@pytest.mark.parametrize("name", ["mapper", "tracker", "sensor"])
+@pytest.mark.parametrize("name", ["mapper", "tracker", "sensor", "archiver"])
 def test_a_process_that_is_killed_twice_changes_nothing(name: str, small: SmallRecording, tmp_path: Path) -> None:
     killed = Disturbance(signals=[(3, name, KILL), (SECTION + 3, name, KILL)])
     fleet_run(small.files, tmp_path / "run", killed)
@@ -103,22 +101,11 @@ def test_sections_leave_memory_within_the_budget_and_are_read_again(small: Small
     plan.execute_in_fleet(tmp_path / "many", calm.hooks())
 
     assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
-    assert calm.children["tracker"].counters["sections.reloaded"] > 0
-    assert 0 < calm.map_peak_bytes <= 3_000_000
-
-
-def test_a_map_that_fills_its_memory_waits_for_the_disk(
-    small: SmallRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(residency, "_MARGIN", 0.0)  # nothing leaves before the mapper asks for room
-    plan = small_plan(small.files, "source.size=200x150", "source.frames=0:8", *LARGE_MAP)
-    plan.execute(tmp_path / "one")
-    calm = Disturbance()
-    plan.execute_in_fleet(tmp_path / "many", calm.hooks())
-
-    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
-    assert len(calm.events) == 1
-    assert re.match(r"mapper: waits: .* \d+ of the map store's 16000000 bytes are in use", calm.events[0])
+    counters = calm.children["archiver"].counters
+    assert counters["sections.reloaded"] > counters.get("sections.prefetched", 0) > 0
+    assert counters["sections.archived"] == FRAMES // 2
+    assert 0 < calm.map_peak_bytes <= 3_000_000 < calm.map_sealed_bytes
+    assert calm.events == []
 
 
 def test_a_map_that_cannot_fit_ends_the_fleet_in_order(small: SmallRecording, tmp_path: Path) -> None:
@@ -147,15 +134,41 @@ def test_deaths_within_writes_to_shared_memory_change_nothing(small: SmallRecord
     fleet_run(small.files, tmp_path / "run", killed)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert (killed.deaths["mapper"], killed.deaths["sensor"], killed.deaths["tracker"]) == (6, 2, 0)
+    assert killed.deaths == {"mapper": 6, "sensor": 2, "tracker": 0, "archiver": 0}
+
+
+def test_deaths_within_writes_to_the_run_folder_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
+    words = ("section.length=2", "tracker.overlap.max_sections=5", "fleet.map_budget_mb=3", "storage.codec='dense'")
+    points = {
+        ("archiver", 1): "run.section.after_write:2",
+        ("archiver", 2): "run.section.after_catalog:1",
+        ("archiver", 3): "run.section.after_trajectory:1",
+        ("archiver", 4): "shm.put.after_write:1",
+        ("archiver", 5): "shm.put.after_link:1",
+    }
+    plan = small_plan(small.files, *words)
+    plan.execute(tmp_path / "one")
+    killed = Disturbance(failpoints=points)
+    plan.execute_in_fleet(tmp_path / "many", killed.hooks())
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
+    assert killed.deaths == {"mapper": 0, "sensor": 0, "tracker": 0, "archiver": len(points)}
+    assert sorted(path.name for path in (tmp_path / "many").iterdir()) == sorted(
+        path.name for path in (tmp_path / "one").iterdir()
+    )
+    with RunFolder.open(tmp_path / "many") as run:
+        told = [event.text for event in run.catalog.events() if event.kind == "restarted"]
+        assert {row.codec for row in run.catalog.sections()} == {"dense"}
+    assert told == [event for event in killed.events if "killed by signal 9" in event]
+    assert len(told) == len(points)
 
 
 def test_all_processes_killed_at_once_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
-    killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper")])
+    killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper", "archiver")])
     fleet_run(small.files, tmp_path / "run", killed)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert killed.deaths == {"sensor": 1, "tracker": 1, "mapper": 1}
+    assert killed.deaths == {"sensor": 1, "tracker": 1, "mapper": 1, "archiver": 1}
 
 
 def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording, tmp_path: Path) -> None:
@@ -163,7 +176,7 @@ def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording,
     fleet_run(small.files, tmp_path / "run", stopped)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert stopped.hangs == {"sensor": 0, "tracker": 1, "mapper": 0}
+    assert stopped.hangs == {"sensor": 0, "tracker": 1, "mapper": 0, "archiver": 0}
     assert len(stopped.events) == 1
     assert stopped.events[0].startswith("tracker: left the bus while it ran after ")
 
