@@ -122,7 +122,7 @@ class ArchiverService:
         waiting = self._record.num_waiting
         self._link.gauges["sections_waiting"] = float(waiting)
         if self._mapper_waits:
-            text = f"the disk is slower than mapping: {waiting} finished sections are not written"
+            text = f"mapping waits for memory: {waiting} finished sections are not on disk yet"
             self._link.tell(ServiceState.DEGRADED, self._last_frame_id, detail=text)
         else:
             self._link.tell(ServiceState.WORKING, self._last_frame_id)
