@@ -8,7 +8,8 @@ import signal
 
 VARIABLE = "VTSLAM_FAILPOINT"
 
-# One at each boundary of the steps in docs/protocol-shm.md, sections 4 to 6, in the order of the steps.
+# One at each boundary of the steps in docs/protocol-shm.md, sections 4 to 6, in the order of the steps; then those of
+# docs/format-run.md, section 1.
 NAMES = (
     "shm.ring.before_claim",
     "shm.ring.after_claim",
@@ -42,6 +43,14 @@ NAMES = (
     "shm.sealed.after_columns",
     "shm.remove.after_rename",
     "shm.remove.after_files",
+    "shm.put.after_write",
+    "shm.put.after_link",
+    "run.section.before_write",
+    "run.section.after_write",
+    "run.section.after_catalog",
+    "run.section.after_trajectory",
+    "run.pack.after_announce",
+    "run.pack.after_rename",
 )
 
 _armed: str | None = None

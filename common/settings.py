@@ -296,6 +296,20 @@ class FleetSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ArchiverSettings:
+    """The process of a fleet that writes the run folder; nothing here changes results.
+
+    Attributes:
+        load_timeout_s: How long tracker and mapper wait for a section that left memory, until they read its file
+            themselves; at most half of `fleet.hang_s`.
+        prefetch: So many sections near to where the camera will be are brought back before they are asked for.
+    """
+
+    load_timeout_s: Annotated[float, Range(0.01, 3600.0)] = 10.0
+    prefetch: Annotated[int, Range(0, 16)] = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StorageSettings:
     """Section files.
 
@@ -331,7 +345,7 @@ class Settings:
     Attributes:
         seed: Key of every random choice.
         holdout: Every so many regular frames one is tracked but kept out of mapping; 0 none.
-        source, splat, section, tracker, mapper, storage, fleet, recorder: The parts.
+        source, splat, section, tracker, mapper, storage, fleet, archiver, recorder: The parts.
     """
 
     seed: Annotated[int, Range(0, 2**31)] = 2
@@ -343,4 +357,5 @@ class Settings:
     mapper: MapperSettings = field(default_factory=MapperSettings)
     storage: StorageSettings = field(default_factory=StorageSettings)
     fleet: FleetSettings = field(default_factory=FleetSettings)
+    archiver: ArchiverSettings = field(default_factory=ArchiverSettings)
     recorder: RecorderSettings = field(default_factory=RecorderSettings)

@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 from vtslam.common.messages import (
     Control,
     Credit,
+    FleetEvent,
     FrameCommitted,
     FrameDescriptor,
     FramePixels,
@@ -245,6 +246,16 @@ STATUS = Topic(
     readers_elsewhere=_ELSEWHERE,
     max_bytes=16384,
 )
+FLEET_EVENT = Topic(
+    suffix="fleet/event",
+    message=FleetEvent,
+    overflow=Overflow.LOSSLESS,
+    history=256,
+    rate_hz=None,
+    recorded=False,
+    publishers=SERVICES,
+    readers_elsewhere=_ELSEWHERE,
+)
 CONTROL = Topic(
     suffix="control/{service}",
     message=Control,
@@ -260,7 +271,7 @@ SECTION_LOAD = QueryTopic(
     reply=SectionReply,
     history=64,
     recorded=False,
-    answerers=_by(Role.ARCHIVER, Role.MAPPER),
+    answerers=_by(Role.ARCHIVER),
 )
 
 TOPICS: tuple[Topic[Any], ...] = (
@@ -273,6 +284,7 @@ TOPICS: tuple[Topic[Any], ...] = (
     SECTION_SEALED,
     SECTION_ARCHIVED,
     STATUS,
+    FLEET_EVENT,
     CONTROL,
 )
 QUERIES: tuple[QueryTopic[Any, Any], ...] = (SECTION_LOAD,)

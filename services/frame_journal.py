@@ -91,6 +91,10 @@ class JournalReader:
         for found in self._sections():
             if found < section_id:
                 _path(self._folder, found).unlink(missing_ok=True)
+        self.skip_before(section_id)
+
+    def skip_before(self, section_id: int) -> None:
+        """Leave out the lines of sections before this one."""
         if section_id > self._section_id:
             self._section_id, self._offset = section_id, 0
 

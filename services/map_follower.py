@@ -17,32 +17,37 @@ from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.section_map import ReadsSections, SectionMap
 
+_LOADS = 3  # a section that was loaded may leave again before it is pinned
+
 
 class StoreArchive:
-    """Sealed sections from the map store, and those that left it from where it left them.
+    """Sealed sections from the map store, where those that left it are brought back if possible.
 
     Args:
         store: The map store.
         elsewhere: Where sections are that are not in memory.
-        on_reload: Told whenever one is read from there.
+        load: Has a section brought into memory; false if it has to be read elsewhere.
     """
 
     def __init__(
-        self, store: MapStore, elsewhere: ReadsSections, *, on_reload: Callable[[], None] = lambda: None
+        self, store: MapStore, elsewhere: ReadsSections, *, load: Callable[[int], bool] = lambda section_id: False
     ) -> None:
-        self._store, self._elsewhere, self._on_reload = store, elsewhere, on_reload
+        self._store, self._elsewhere, self._load = store, elsewhere, load
 
     def read(self, section_id: int) -> Section:
         """A finished section: a copy, so that it may leave the store."""
-        try:
-            held = self._store.pinned_sealed(section_id)
-        except SectionNotResident:
-            self._on_reload()
-            return self._elsewhere.read(section_id)
-        try:
-            return _copied(held.section).retied()
-        finally:
-            held.release()
+        for _ in range(_LOADS):
+            try:
+                held = self._store.pinned_sealed(section_id)
+            except SectionNotResident:
+                if not self._load(section_id):
+                    break
+                continue
+            try:
+                return _copied(held.section).retied()
+            finally:
+                held.release()
+        return self._elsewhere.read(section_id)
 
     def view_depth(self, section_id: int, section_row: int) -> npt.NDArray[np.uint16]:
         """The depth uint16 [H,W] that a finished section keeps of a frame: a copy."""

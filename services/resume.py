@@ -8,9 +8,9 @@ from vtslam.common.settings import SectionSettings
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.sensor.sources.base import Source
 from vtslam.storage.catalog_rows import STORED, SectionRow
-from vtslam.storage.errors import ChecksumMismatch, RunFolderError
+from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.section_facts import file_facts
+from vtslam.storage.section_care import require_intact
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,16 +69,3 @@ def prepare_to_resume(run: RunFolder, source: Source, *, section: SectionSetting
             f"{run.path}: frame {frame.frame_id} of {source.uri} is not the one that was mapped; the recording changed"
         )
     return ResumePoint(section_id=last.section_id, facts=facts, frame=frame)
-
-
-def require_intact(run: RunFolder, row: SectionRow) -> None:
-    """Raise StorageError unless a section's file is, by its size and footer, the one of the catalogue."""
-    path, advice = run.section_path(row.section_id), f"(vtslam sections repair {run.path} sets it aside)"
-    found = file_facts(path)
-    if (found.num_bytes, found.sha256) != (row.num_bytes, row.sha256):
-        raise ChecksumMismatch.differing(
-            path,
-            "file",
-            expected=f"{row.num_bytes} bytes with SHA-256 {row.sha256.hex()[:16]}...",
-            found=f"{found.num_bytes} with {found.sha256.hex()[:16]}... {advice}",
-        )

@@ -60,6 +60,11 @@ class RunRecord:
         """The frame committed last; -1 if there is none."""
         return self._frames[-1].facts.frame_id if self._frames else self._last_durable
 
+    @property
+    def last_durable_frame_id(self) -> int:
+        """The last frame of a section on disk; -1 if there is none."""
+        return self._last_durable
+
     def add(self, frame: CommittedFrame) -> None:
         """One more frame, or the last one again with what was learned of it since; durable ones are left alone."""
         if self._frames and self._frames[-1].facts.frame_id == frame.facts.frame_id:

@@ -4,9 +4,9 @@ import os
 import signal
 from types import FrameType
 
-from vtslam.common.bus import Bus
-from vtslam.common.messages import Command, ServiceState, ServiceStatus
-from vtslam.common.topics import CONTROL, STATUS
+from vtslam.common.bus import Bus, Publisher
+from vtslam.common.messages import Command, FleetEvent, ServiceState, ServiceStatus
+from vtslam.common.topics import CONTROL, FLEET_EVENT, STATUS
 from vtslam.services.process_facts import peak_rss_mb
 
 HEARTBEAT_S = 0.5
@@ -31,6 +31,7 @@ class ServiceLink:
         self._orders = bus.subscriber(CONTROL, service=self._name)
         self._status = bus.publisher(STATUS, service=self._name)
         self._token = bus.declare_alive()
+        self._events: Publisher[FleetEvent] | None = None
         self._told: ServiceState | None = None
         self._told_ns = 0
         self.drain_through: int | None = None
@@ -78,6 +79,16 @@ class ServiceLink:
                 last_frame_id=last_frame_id,
                 counters=dict(self.counters),
                 gauges={**self.gauges, "peak_rss_mb": peak_rss_mb()},
-                detail="".join(c for c in detail if c.isprintable())[:256],
+                detail=_printable(detail),
             )
         )
+
+    def event(self, kind: str, text: str) -> None:
+        """Tell the user, and the run's catalogue, what happened."""
+        self._events = self._events or self._bus.publisher(FLEET_EVENT)
+        now_ns = self._bus.clock.wall_ns()
+        self._events.publish(FleetEvent(service=self._name, kind=kind, text=_printable(text), time_ns=now_ns))
+
+
+def _printable(text: str) -> str:
+    return "".join(c for c in text if c.isprintable())[:256]

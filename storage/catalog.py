@@ -58,6 +58,8 @@ JOIN poses p ON p.frame_id = f.frame_id
 JOIN anchors a ON a.section_id = f.section_id
   AND a.version = (SELECT max(version) FROM anchors WHERE section_id = f.section_id)
 WHERE f.section_id >= ? AND f.section_id < ? ORDER BY f.frame_id"""
+_ADD_EVENT = """INSERT INTO events (time_ns, kind, text)
+SELECT ?1, ?2, ?3 WHERE NOT EXISTS (SELECT 1 FROM events WHERE time_ns = ?1 AND kind = ?2 AND text = ?3)"""
 _SECTION_COLUMNS = (
     "section_id, first_frame_id, num_frames, num_gaussians, camera, depth_scale_m, num_bytes, sha256, codec, state, "
     "next_sha256"
@@ -299,10 +301,10 @@ class Catalog:
 
     # --- events -----------------------------------------------------------------------------------------------------
 
-    def add_event(self, kind: str, text: str) -> None:
-        """Note that something happened now."""
+    def add_event(self, kind: str, text: str, *, time_ns: int | None = None) -> None:
+        """Note that something happened: now, or at ``time_ns`` (Unix time), unless the same is noted already."""
         with self._transaction() as db:
-            db.execute("INSERT INTO events (time_ns, kind, text) VALUES (?,?,?)", (time.time_ns(), kind, text))
+            db.execute(_ADD_EVENT, (time_ns or time.time_ns(), kind, text))
 
     def events(self) -> list[Event]:
         """What happened, in order."""

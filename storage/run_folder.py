@@ -6,6 +6,7 @@
     RUN/catalog.sqlite       what is durable: sections, frames, poses, candidate views, events (docs/format-run.md)
     RUN/sections/000042.vts  a finished section (docs/format-section.md)
     RUN/trajectory.txt       TUM format; made from the catalogue, longer with each section
+    RUN/packed/              sections packed ahead of the run's end, as long as the run lasts
     RUN/damaged/             files that were set aside
     RUN/lock                 held by the one process that writes the run
 
@@ -24,6 +25,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common import failpoints
 from vtslam.common.trajectory_io import trajectory_text
 from vtslam.storage.atomic import (
     append_to_file,
@@ -44,6 +46,7 @@ from vtslam.storage.section_file import read_columns, read_section, write_sectio
 from vtslam.storage.section_record import SectionRecord
 
 _INFO, _CATALOG, _TRAJECTORY, _SECTIONS, _LOCK = "run.toml", "catalog.sqlite", "trajectory.txt", "sections", "lock"
+_PACKED = "packed"
 WRITTEN_CODEC: SectionCodec = "lossless"  # of sections as a run writes them
 _CATALOG_FILES = (_CATALOG, f"{_CATALOG}-wal", f"{_CATALOG}-shm")
 _DERIVED = ("metrics.json", "report.json")  # made from a run; wrong beside another one
@@ -96,8 +99,13 @@ class RunFolder:
         return run
 
     @classmethod
-    def open(cls, path: Path, *, writable: bool = False) -> Self:
+    def open(cls, path: Path, *, writable: bool = False, lock: int | None = None) -> Self:
         """Open a run folder; for writing, take its lock and delete what a crashed writer left half done.
+
+        Args:
+            path: The folder.
+            writable: Whether for writing.
+            lock: :attr:`lock` of another process that holds the folder for this one to write, handed down to it.
 
         Raises:
             RunFolderError: There is no run in ``path``.
@@ -111,10 +119,10 @@ class RunFolder:
         if not writable:
             return run
         try:
-            run._lock = _take_lock(path)
+            run._lock = _take_lock(path) if lock is None else lock
             run._catalog = Catalog.open(path / _CATALOG, writable=True)
-            sweep_temporaries(path)
-            sweep_temporaries(path / _SECTIONS)
+            for folder in (path, path / _SECTIONS, path / _PACKED):
+                sweep_temporaries(folder)
         except OSError as error:
             run.close()
             raise write_failed(path, error) from error
@@ -131,6 +139,11 @@ class RunFolder:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+    @property
+    def lock(self) -> int | None:
+        """The descriptor that holds the lock; the lock lasts until all processes that have it have closed it."""
+        return self._lock
 
     def __enter__(self) -> Self:
         return self
@@ -186,10 +199,13 @@ class RunFolder:
         """Where a section is, or will be."""
         return self.path / _SECTIONS / f"{section_id:06d}.vts"
 
+    def packed_path(self, section_id: int) -> Path:
+        """Where a section is, or will be, packed ahead of the run's end."""
+        return self.path / _PACKED / f"{section_id:06d}.vts"
+
     def section_ids(self) -> list[int]:
         """Ids of the sections on disk, in order."""
-        names = (_SECTION_NAME.fullmatch(path.name) for path in (self.path / _SECTIONS).glob("*.vts"))
-        return sorted(int(name[1]) for name in names if name)
+        return _section_ids(self.path / _SECTIONS)
 
     def write_section(self, record: SectionRecord) -> Path:
         """Write a finished section, durable and verified; where it is. It counts once it is in the catalogue.
@@ -202,7 +218,9 @@ class RunFolder:
         path = self.section_path(record.section_id)
         if path.exists():
             raise RunFolderError(f"{path}: section {record.section_id} is already written; it never changes")
+        failpoints.reach("run.section.before_write")
         write_section(path, record, WRITTEN_CODEC)
+        failpoints.reach("run.section.after_write")
         return path
 
     def commit_section(
@@ -238,13 +256,25 @@ class RunFolder:
             codec=codec,
         )
         self.catalog.add_section(record, row, frames, resume=resume)
+        failpoints.reach("run.section.after_catalog")
         self._lengthen_trajectory(frames)
+        failpoints.reach("run.section.after_trajectory")
 
     def add_loose_frames(self, section_id: int, frames: Sequence[FrameRow]) -> None:
         """Keep the poses and facts of frames whose section will never be on disk; raises StorageError."""
         self._require_writable()
         self.catalog.add_loose_frames(section_id, frames)
         self._lengthen_trajectory(frames)
+
+    def remove_packed(self) -> None:
+        """Delete what was packed ahead, which has no use once the run has ended."""
+        self._require_writable()
+        remove_files([self.packed_path(each) for each in self._packed_ids()])
+        try:
+            if (self.path / _PACKED).is_dir():
+                (self.path / _PACKED).rmdir()
+        except OSError as error:
+            raise write_failed(self.path / _PACKED, error) from error
 
     def _lengthen_trajectory(self, frames: Sequence[FrameRow]) -> None:
         times_ns, poses = [frame.capture_time_ns for frame in frames], [frame.T_world_camera for frame in frames]
@@ -255,6 +285,7 @@ class RunFolder:
         self._require_writable()
         self.catalog.drop_from(first_section_id)
         remove_files(self.section_path(each) for each in self.section_ids() if each >= first_section_id)
+        remove_files(self.packed_path(each) for each in self._packed_ids() if each >= first_section_id)
         self.write_trajectory()
 
     def read_section(self, section_id: int) -> SectionRecord:
@@ -270,6 +301,9 @@ class RunFolder:
         _, columns = read_columns(self.section_path(section_id), ["view_index", "view_depth"])
         return columns["view_index"], columns["view_depth"]
 
+    def _packed_ids(self) -> list[int]:
+        return _section_ids(self.path / _PACKED)
+
     def _require_writable(self) -> None:
         if self._lock is None:
             raise RunFolderError(f"{self.path}: open for reading only")
@@ -283,12 +317,19 @@ class RunFolder:
             sweep_temporaries(sections)
             for section_id in self.section_ids():
                 self.section_path(section_id).unlink()
+            for section_id in self._packed_ids():
+                self.packed_path(section_id).unlink()
             for name in (_TRAJECTORY, *_CATALOG_FILES, *_DERIVED):
                 (self.path / name).unlink(missing_ok=True)
             sync_folder(sections)
             sync_folder(self.path)
         except OSError as error:
             raise write_failed(self.path, error) from error
+
+
+def _section_ids(folder: Path) -> list[int]:
+    names = (_SECTION_NAME.fullmatch(path.name) for path in folder.glob("*.vts"))
+    return sorted(int(name[1]) for name in names if name)
 
 
 def _refuse_unless_free(path: Path, overwrite: bool) -> None:

@@ -4,14 +4,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vtslam.storage.atomic import remove_files, rename_file, sync_folder, temporary_path
+from vtslam.common import failpoints
+from vtslam.storage.atomic import remove_files, rename_file, sync_folder, temporary_path, write_failed
 from vtslam.storage.catalog_rows import STORED, SectionRow
 from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import ChecksumMismatch, MalformedSection, StorageError, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.section_codecs import SectionCodec
+from vtslam.storage.section_codecs import SectionCodec, codec_of_header
 from vtslam.storage.section_facts import file_facts
-from vtslam.storage.section_file import read_section, verify_file, write_section
+from vtslam.storage.section_file import read_columns, read_section, verify_file, write_section
 from vtslam.storage.section_record import SectionRecord
 
 WriteSection = Callable[[Path, SectionRecord, SectionCodec, DenseGrid | None], None]
@@ -68,11 +69,43 @@ def repair(run: RunFolder) -> list[str]:
     return done
 
 
+def require_intact(run: RunFolder, row: SectionRow) -> None:
+    """Raise StorageError unless a section's file is, by its size and footer, the one of the catalogue."""
+    path, advice = run.section_path(row.section_id), f"(vtslam sections repair {run.path} sets it aside)"
+    found = file_facts(path)
+    if (found.num_bytes, found.sha256) != (row.num_bytes, row.sha256):
+        raise ChecksumMismatch.differing(
+            path,
+            "file",
+            expected=f"{row.num_bytes} bytes with SHA-256 {row.sha256.hex()[:16]}...",
+            found=f"{found.num_bytes} with {found.sha256.hex()[:16]}... {advice}",
+        )
+
+
+def pack_ahead(run: RunFolder, section_id: int, *, codec: SectionCodec, grid: DenseGrid | None = None) -> None:
+    """Write a section with another codec beside its file, for :func:`repack` to take when the run has ended.
+
+    Until then the section is read from its own file: what a codec has rounded would be another map.
+
+    Raises:
+        StorageError: The section cannot be read or written; it is as it was.
+    """
+    path = run.packed_path(section_id)
+    if not path.parent.is_dir():
+        try:
+            path.parent.mkdir()
+        except OSError as error:
+            raise write_failed(path, error) from error
+        sync_folder(run.path)
+    write_section(path, run.read_section(section_id), codec, grid)
+
+
 def repack_all(run: RunFolder, codec: SectionCodec, grid: DenseGrid | None = None) -> None:
-    """Bring the files of all sections on disk into ``codec``, one after another; see :func:`repack`."""
+    """Bring the files of all sections on disk into ``codec``, those packed ahead at little cost; see :func:`repack`."""
     for row in run.catalog.sections():
         if row.state == STORED and row.codec != codec:
-            repack(run, row.section_id, codec=codec, grid=grid)
+            repack(run, row.section_id, codec=codec, grid=grid, is_packed=_is_packed(run, row.section_id, codec))
+    run.remove_packed()
 
 
 def repack(
@@ -81,6 +114,7 @@ def repack(
     *,
     codec: SectionCodec,
     grid: DenseGrid | None = None,
+    is_packed: bool = False,
     write: WriteSection = write_section,
 ) -> tuple[int, int]:
     """Write a section's file anew with another codec; at any time the run has one whole file of it.
@@ -90,6 +124,7 @@ def repack(
         section_id: The section.
         codec: The codec. What ``fast`` or ``dense`` once rounded stays rounded.
         grid: What ``dense`` rounds to; None for the usual grid.
+        is_packed: Whether :func:`pack_ahead` has written that file, and it is whole.
         write: Writes a record to a new file, durable and verified.
 
     Returns:
@@ -102,16 +137,29 @@ def repack(
     if row is None or row.state != STORED:
         raise UnreadableFile(f"{run.section_path(section_id)}: expected a section on disk, found none")
     path = run.section_path(section_id)
-    temporary = temporary_path(path)
+    source = run.packed_path(section_id) if is_packed else temporary_path(path)
     try:
-        write(temporary, run.read_section(section_id), codec, grid)
-        new = file_facts(temporary)
+        if not is_packed:
+            write(source, run.read_section(section_id), codec, grid)
+        new = file_facts(source)
         run.catalog.announce_file(section_id, new.sha256)
-        rename_file(temporary, path)
+        failpoints.reach("run.pack.after_announce")
+        rename_file(source, path)
+        failpoints.reach("run.pack.after_rename")
     finally:
-        remove_files([temporary])
+        remove_files([source])
     run.catalog.set_file(section_id, sha256=new.sha256, num_bytes=new.num_bytes, codec=codec)
     return row.num_bytes, new.num_bytes
+
+
+def _is_packed(run: RunFolder, section_id: int, codec: SectionCodec) -> bool:
+    """Whether a section was packed ahead in this codec, and is whole."""
+    path = run.packed_path(section_id)
+    try:
+        verify_file(path)
+        return codec_of_header(read_columns(path, [])[0]) == codec
+    except StorageError:
+        return False
 
 
 def _problem_of(run: RunFolder, row: SectionRow) -> str | None:
@@ -165,6 +213,8 @@ def _set_aside(run: RunFolder, health: SectionHealth, *, is_named: bool) -> str:
         what = f"set aside as {folder / name}"
     else:
         what = "missing"
+    if (packed := run.packed_path(health.section_id)).exists():
+        remove_files([packed])
     if is_named:
         run.catalog.set_missing(health.section_id)
     return f"{health.problem}; {what}"

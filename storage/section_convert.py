@@ -46,6 +46,11 @@ def record_of(section: Section) -> SectionRecord:
 
 def section_of(record: SectionRecord) -> Section:
     """The section of a record, its Gaussians' positions computed from its frames' poses."""
+    return untied_section_of(record).retied()
+
+
+def untied_section_of(record: SectionRecord) -> Section:
+    """As :func:`section_of`, without positions and surface."""
     row_of_view = {int(row): index for index, row in enumerate(record.view_index)}
     frames = tuple(
         SectionFrame(
@@ -76,7 +81,7 @@ def section_of(record: SectionRecord) -> Section:
         gaussians=gaussians,
         means_m=np.zeros((0, 3), np.float32),
         surface=np.zeros((0, 6), np.float32),
-    ).retied()
+    )
 
 
 _VIEW_BYTES = 24 * 10**6  # depth of candidate views kept in memory

@@ -14,7 +14,7 @@ from vtslam.common.messages.mapping import (
     TrackerHistory,
 )
 from vtslam.common.messages.rules import MessageError, Reason
-from vtslam.common.messages.running import Command, Control, ServiceState, ServiceStatus
+from vtslam.common.messages.running import Command, Control, FleetEvent, ServiceState, ServiceStatus
 from vtslam.common.messages.sensing import Credit, FrameCondition, FrameDescriptor, FramePixels
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Control",
     "Credit",
     "Envelope",
+    "FleetEvent",
     "FrameCommitted",
     "FrameCondition",
     "FrameDescriptor",

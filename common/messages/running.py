@@ -1,4 +1,4 @@
-"""Messages about the processes themselves: their state, and what they are told to do."""
+"""Messages about the processes themselves: their state, what befell them, and what they are told to do."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -47,6 +47,26 @@ class ServiceStatus(Message):
     counters: Annotated[dict[str, int], Table(Integer(0, MAX_INT), _MAX_FIGURES)] = field(default_factory=dict)
     gauges: Annotated[dict[str, float], Table(Real(), _MAX_FIGURES)] = field(default_factory=dict)
     detail: Note = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FleetEvent(Message):
+    """Something that the user should know, and that the run's catalogue keeps.
+
+    Attributes:
+        service: Who tells.
+        kind: In a word, as in "restarted".
+        text: In words.
+        time_ns: Unix time when it happened.
+    """
+
+    KIND: ClassVar[str] = "fleet_event"
+    VERSION: ClassVar[int] = 1
+
+    service: Name
+    kind: Name
+    text: Note
+    time_ns: Count
 
 
 class Command(StrEnum):

@@ -207,10 +207,12 @@ class MapStore:
         new = self._temporary("new", path)
         with self._removed_on_failure(new):
             write_sealed(new, section, self._admit, pins=self._pins)
+            failpoints.reach("shm.put.after_write")
             try:
                 os.link(new, path)  # unlike renaming, this never replaces what is there
             except FileExistsError as error:
                 raise SharedMemoryError(f"{path}: a sealed section never changes, and this one is there") from error
+            failpoints.reach("shm.put.after_link")
             new.unlink()
 
     def restore(self, section: Section, last: Frame, facts: bytes) -> None:
@@ -247,14 +249,18 @@ class MapStore:
         path.unlink(missing_ok=True)
 
     def remove_leftovers(self) -> None:
-        """Remove what dead processes left half made or half deleted, active blocks of sealed sections, old tails."""
+        """For the mapper: :meth:`remove_unfinished`, active blocks of sealed sections, and old tails."""
+        self.remove_unfinished()
+        for section_id in set(self._ids("active")) & set(self._ids("sealed")):
+            self._remove(self._path("active", section_id))
+        self._remove_old_tails()
+
+    def remove_unfinished(self) -> None:
+        """Remove what dead processes left half made or half deleted; for any process at any time."""
         for name in os.listdir(self._folder):
             leftover = _LEFTOVER.fullmatch(name)
             if leftover and not is_alive(int(leftover[1], 16)):
                 _delete(self._folder / name)
-        for section_id in set(self._ids("active")) & set(self._ids("sealed")):
-            self._remove(self._path("active", section_id))
-        self._remove_old_tails()
 
     # --- parts ------------------------------------------------------------------------------------------------------
 

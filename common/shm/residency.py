@@ -1,11 +1,13 @@
 """Which sealed sections stay in memory: a pure policy over plain facts (docs/protocol-shm.md, section 7)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
+
+_ALIKE = 0.5  # least cosine between viewing directions that may see the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,23 +95,45 @@ def predicted_position_m(
     return newer_m + frames_ahead * (newer_m - older_m)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewPlaces:
+    """Where candidate views were taken, and which way they look.
+
+    Attributes:
+        section_ids: int64 [V].
+        positions_m: float64 [V,3], world.
+        directions: float64 [V,3], world, of length 1.
+    """
+
+    section_ids: npt.NDArray[np.int64]
+    positions_m: npt.NDArray[np.float64]
+    directions: npt.NDArray[np.float64]
+
+
 def wanted_soon(
-    positions_m: Mapping[int, npt.NDArray[np.float64]],
+    places: ViewPlaces,
     predicted_m: npt.NDArray[np.float64],
+    direction: npt.NDArray[np.float64],
     *,
     radius_m: float,
     at_most: int,
 ) -> list[int]:
-    """Sections whose head is within ``radius_m`` of a predicted position float64 [3], nearest first (ties by id).
+    """Sections with a view within ``radius_m`` of a predicted position, nearest first (ties by id).
 
     Args:
-        positions_m: Head position float64 [3] (m, world) by section, resident or not.
-        predicted_m: The predicted camera position.
-        radius_m: How far a section is still near.
-        at_most: How many to name.
+        places: Views of all sections, resident or not; those that look more than 60 degrees another way do not count.
+        predicted_m: The predicted camera position float64 [3] (m, world).
+        direction: The way that the camera looks, float64 [3] of length 1.
+        radius_m: How far a view is still near.
+        at_most: How many sections to name.
     """
-    distances = ((float(np.linalg.norm(position - predicted_m)), i) for i, position in positions_m.items())
-    return [i for distance, i in sorted(distances) if distance <= radius_m][: max(at_most, 0)]
+    distances = np.linalg.norm(places.positions_m - predicted_m, axis=1)
+    near = np.flatnonzero((distances <= radius_m) & (places.directions @ direction >= _ALIKE))
+    nearest: dict[int, float] = {}
+    for row in near.tolist():
+        section_id = int(places.section_ids[row])
+        nearest[section_id] = min(float(distances[row]), nearest.get(section_id, np.inf))
+    return sorted(nearest, key=lambda i: (nearest[i], i))[: max(at_most, 0)]
 
 
 def to_prefetch(wanted: Iterable[int], resident: Iterable[int], loading: Iterable[int]) -> list[int]:

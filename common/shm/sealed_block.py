@@ -11,6 +11,7 @@ import numpy.typing as npt
 from vtslam.common import failpoints
 from vtslam.common.frame import Frame
 from vtslam.common.gaussians import ViewTiedGaussians
+from vtslam.common.geometry.camera import Camera
 from vtslam.common.section import Section
 from vtslam.common.shm.blocks import (
     CONTROL_BYTES,
@@ -80,7 +81,14 @@ def _columns(counts: Any) -> tuple[dict[str, tuple[int, np.dtype[Any], tuple[int
 
 def sealed_bytes(section: Section) -> int:
     """Bytes that a section takes once it is sealed."""
-    return CONTROL_BYTES + _columns(_sealed_description(section)[0])[1]
+    views = sum(frame.view_depth is not None for frame in section.frames)
+    return sealed_bytes_of(section.camera, frames=len(section.frames), views=views, gaussians=section.gaussians.count)
+
+
+def sealed_bytes_of(camera: Camera, *, frames: int, views: int, gaussians: int) -> int:
+    """Bytes that a sealed section takes with so many frames, views that keep their depth, and Gaussians."""
+    counts = {"frames": frames, "views": views, "gaussians": gaussians, "width": camera.width, "height": camera.height}
+    return CONTROL_BYTES + _columns(counts)[1]
 
 
 def _sealed_description(section: Section) -> npt.NDArray[Any]:

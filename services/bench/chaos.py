@@ -21,15 +21,16 @@ from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.supervisor import Supervisor
 from vtslam.storage.run_folder import RunFolder
 
-_SERVICES = ("sensor", "tracker", "mapper")
-_POINT_STARTS = (2, 4, 6)  # starts of sensor and mapper that die within a write to shared memory
+_SERVICES = ("sensor", "tracker", "mapper", "archiver")
+_POINT_STARTS = (2, 4, 6)  # starts that die within a write to shared memory, or to the run folder
 _STOP_S = 15.0
 _LATEST_S = 0.5  # after its frame
 _WITHIN_WRITES = {
     "sensor": ("after_claim", "after_color", "after_pixels", "after_words", "before_publish"),
     "mapper": ("after_reserve", "after_frames", "after_images", "after_ties", "after_colors", "before_flip"),
+    "archiver": ("before_write", "after_write", "after_catalog", "after_trajectory"),
 }
-_PREFIXES = {"sensor": "shm.ring.", "mapper": "shm.commit."}
+_PREFIXES = {"sensor": "shm.ring.", "mapper": "shm.commit.", "archiver": "run.section."}
 
 
 @dataclass(slots=True)
@@ -120,7 +121,7 @@ def bench_chaos(
 
     Args:
         plan: The run.
-        kills: SIGKILLs sent, evenly over the services; those within writes to shared memory come on top.
+        kills: SIGKILLs sent, evenly over the services; those within writes to shared memory and run folder come on top.
         hangs: SIGSTOPs of 15 s.
         seed: Draws the plan of both.
         on_frame: Called after each frame of the second run.
@@ -139,7 +140,8 @@ def bench_chaos(
     return {
         "kills": sum(killed.values()),
         "kills_by_service": killed,
-        "kills_in_shm_write": sum(killed.values()) - sum(sent_kills.values()),
+        "kills_in_shm_write": sum(killed[name] - sent_kills[name] for name in ("sensor", "mapper")),
+        "kills_in_run_folder_write": killed["archiver"] - sent_kills["archiver"],
         "hangs": sum(disturber.sent[name, signal.SIGSTOP] for name in _SERVICES),
         "frames_missing": sum(frame_id not in counts for frame_id in range(len(plan.source))),
         "frames_duplicated": sum(count - 1 for count in counts.values()),

@@ -121,7 +121,9 @@ def _costs(watch: FleetWatch, windows: tuple[Window, Window]) -> dict[str, Any]:
         "rss_growth": round(max(known), 4) if known else None,
         "rss_growth_by_process": {name: each and round(each, 4) for name, each in growth.items()},
         "rss_mb": {name: round(max(values), 1) for name, values in watch.rss_mb.items()},
-        "sections_reloaded": sum(counts.get("sections.reloaded", 0) for counts in watch.counters.values()),
+        "sections_reloaded": sum(
+            counts.get("sections.reloaded", 0) + counts.get("sections.read", 0) for counts in watch.counters.values()
+        ),
         "shm_peak_mb": round(watch.map_peak_mb, 3),
     }
 

@@ -42,8 +42,8 @@ class FleetWatch:
 
     def on_step(self, supervisor: Supervisor) -> None:
         """To be called at each step of the supervisor."""
-        self.map_peak_mb = 1e-6 * supervisor.residency.peak_bytes
-        self.map_mb = 1e-6 * supervisor.residency.sealed_bytes
+        self.map_peak_mb = 1e-6 * supervisor.progress.map_peak_bytes
+        self.map_mb = 1e-6 * supervisor.progress.map_bytes
         self.counters = {name: dict(child.counters) for name, child in supervisor.children.items()}
         pids = {name: child.pid for name, child in supervisor.children.items()}
         if any(pid is None for pid in pids.values()) or (self.at_frames and self.at_frames[-1] == self.frames):

@@ -18,7 +18,7 @@ from vtslam.common.shm.records import ActiveSpec, Commit
 from vtslam.common.shm.ring_layout import FrameDescriptor
 from vtslam.common.shm.sealed_block import sealed_bytes
 from vtslam.common.splat.engine import Engine
-from vtslam.common.topics import MAPPER_COMMITTED, SECTION_SEALED
+from vtslam.common.topics import MAPPER_COMMITTED, SECTION_ARCHIVED, SECTION_SEALED
 from vtslam.services.commit_facts import CommitFacts, pixels_crc32
 from vtslam.services.frame_facts import CommittedFrame, Seconds, frame_facts, untracked_state
 from vtslam.services.frame_journal import JournalWriter
@@ -32,7 +32,7 @@ from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 from vtslam.services.shared_sections import active_section_of, commit_of
 
 _NO_ROOM_S = 0.1  # until memory is asked for again
-_GIVE_UP_S = 60.0  # without memory
+_GIVE_UP_S = 60.0  # without memory, although all that is finished could leave it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,6 +89,7 @@ class MapperService:
         self._intake: PoseIntake = NewestPose(bus) if pace.is_realtime else EveryPose(bus)
         self._committed = bus.publisher(MAPPER_COMMITTED)
         self._sealed = bus.publisher(SECTION_SEALED)
+        self._archived, self._num_durable = bus.subscriber(SECTION_ARCHIVED), 0
         self._ring: FrameRingReader | None = None
         self._active: ActiveSection | None = None
         self._facts: CommitFacts | None = None
@@ -258,11 +259,14 @@ class MapperService:
 
     def _wait_for_room(self, error: MapStoreFull | SharedMemoryFull) -> float:
         """Sections leave the store once they are on disk; if that does not help in time, the error is raised."""
-        now_ns = self._clock.monotonic_ns()
-        self._no_room_since_ns = self._no_room_since_ns or now_ns
-        if not self._store.sealed_ids() or now_ns - self._no_room_since_ns > _GIVE_UP_S * 1e9:
+        now_ns, sealed = self._clock.monotonic_ns(), self._store.sealed_ids()
+        while (archived := self._archived.receive()) is not None:
+            self._num_durable = max(self._num_durable, archived.message.section_id + 1)
+        if self._no_room_since_ns is None or any(section_id >= self._num_durable for section_id in sealed):
+            self._no_room_since_ns = now_ns  # what the disk takes is not this service's to judge
+        if not sealed or now_ns - self._no_room_since_ns > _GIVE_UP_S * 1e9:
             raise error
-        self._link.tell(ServiceState.DEGRADED, self._last_frame_id, detail=str(error))
+        self._link.tell(ServiceState.DEGRADED, self._last_frame_id, detail=f"waits: {error}")
         return _NO_ROOM_S
 
     # --- the end of a section ---------------------------------------------------------------------------------------

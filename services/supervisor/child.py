@@ -38,6 +38,7 @@ class _Parts:
     run: "RunFolder"
     settings: "Settings"
     source: str
+    run_lock: int | None
 
     @property
     def is_live(self) -> bool:
@@ -62,10 +63,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     words.add_argument("--base", type=Path, required=True)
     words.add_argument("--epoch", type=int, required=True)
     words.add_argument("--parent", type=int, required=True)
+    words.add_argument("--run-lock", type=int)
     args = words.parse_args(argv)
     _die_with(args.parent)
     folder = FleetFolder.open(args.fleet, base=args.base)
-    return _run(args.name, folder, args.fleet, args.epoch)
+    return _run(args, folder)
 
 
 def _die_with(parent: int) -> None:
@@ -75,7 +77,7 @@ def _die_with(parent: int) -> None:
         os._exit(1)
 
 
-def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
+def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
     from vtslam.common.bus import Member, run_steps
     from vtslam.common.bus_zenoh import join
     from vtslam.common.config import load
@@ -89,17 +91,18 @@ def _run(name: str, folder: FleetFolder, fleet: str, epoch: int) -> int:
     from vtslam.storage.run_folder import RunFolder
 
     keep_large_arrays_apart()
+    name: str = args.name
     owner = read_owner(folder.path)
     assert owner is not None
     run = RunFolder.open(Path(owner.run_folder))
     info = run.read_info()
     settings = load(Settings, [(str(run.path), info.settings)])
-    member = Member(fleet=fleet, role=process_named(name).role, name=name)
+    member = Member(fleet=args.fleet, role=process_named(name).role, name=name)
     with join(member, folder.path) as bus:
-        link = ServiceLink(bus, epoch)
+        link = ServiceLink(bus, args.epoch)
         link.stop_on_sigterm()
         try:
-            parts = _Parts(bus, link, folder, run, settings, info.facts.source)
+            parts = _Parts(bus, link, folder, run, settings, info.facts.source, args.run_lock)
             run_steps(_BUILDERS[name](parts), bus)
             folder.write_counts(name, link.counters)
         except (SourceError, StorageError, MapStoreFull, SharedMemoryFull) as error:
@@ -169,12 +172,31 @@ def _mapper(parts: _Parts) -> "Steps":
 
 
 def _archive(parts: _Parts, store: "MapStore") -> "StoreArchive":
-    """Sealed sections: the map store's, and the run folder's for those that left it."""
+    """Sealed sections: the map store's, where the archiver brings back those that left it."""
     from vtslam.services.map_follower import StoreArchive
+    from vtslam.services.section_loader import SectionLoader
     from vtslam.storage.section_convert import SectionArchive
 
-    on_disk = SectionArchive(parts.run)
-    return StoreArchive(store, on_disk, on_reload=lambda: parts.link.count("sections.reloaded"))
+    settings = parts.settings
+    timeout_s = min(settings.archiver.load_timeout_s, settings.fleet.hang_s / 2)
+    loader = SectionLoader(parts.bus, parts.link, timeout_s=timeout_s)
+    return StoreArchive(store, SectionArchive(parts.run), load=loader.load)
+
+
+def _archiver(parts: _Parts) -> "Steps":
+    from vtslam.services.archiver.service import ArchiverService
+    from vtslam.services.frame_journal import JournalReader
+    from vtslam.services.supervisor.store import map_store
+    from vtslam.storage.run_folder import RunFolder
+
+    return ArchiverService(
+        parts.bus,
+        parts.link,
+        parts.settings,
+        map_store(parts.folder, parts.settings),
+        RunFolder.open(parts.run.path, writable=True, lock=parts.run_lock),
+        JournalReader(parts.folder.journal_path),
+    )
 
 
 def _recorder(parts: _Parts) -> "Steps":
@@ -190,6 +212,7 @@ _BUILDERS: dict[str, Callable[[_Parts], "Steps"]] = {
     "sensor": _sensor,
     "tracker": _tracker,
     "mapper": _mapper,
+    "archiver": _archiver,
     "recorder": _recorder,
 }
 

@@ -27,6 +27,7 @@ class ChildProcess:
         fleet: Name of the fleet.
         folder: The fleet's folder.
         hang_s: Silence of its work loop that is a hang.
+        run_lock: Descriptor of the run folder's lock for a process that writes there; it keeps its number.
 
     Attributes:
         epoch: How often it was started.
@@ -36,8 +37,11 @@ class ChildProcess:
         hangs: How often it was killed for being silent.
     """
 
-    def __init__(self, process: Process, *, fleet: str, folder: FleetFolder, hang_s: float) -> None:
+    def __init__(
+        self, process: Process, *, fleet: str, folder: FleetFolder, hang_s: float, run_lock: int | None = None
+    ) -> None:
         self.process, self._fleet, self._folder, self._hang_s = process, fleet, folder, hang_s
+        self._handed_down = () if run_lock is None else (run_lock,)
         self.epoch = self.deaths = self.hangs = 0
         self.status: ServiceStatus | None = None
         self.finished = False
@@ -76,11 +80,13 @@ class ChildProcess:
         self._heard_s = self._present_s = now_s
         words = [self.process.name, self._fleet, "--base", str(self._folder.path.parent)]
         words += ["--epoch", str(self.epoch), "--parent", str(os.getpid())]
+        words += [word for each in self._handed_down for word in ("--run-lock", str(each))]
         self._popen = subprocess.Popen(
             [sys.executable, "-m", _MODULE, *words],
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **environment},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
+            pass_fds=self._handed_down,
             start_new_session=True,  # Ctrl-C in a terminal is for the supervisor
         )
 

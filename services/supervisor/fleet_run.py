@@ -12,6 +12,7 @@ from vtslam.common.bus_zenoh import Hub
 from vtslam.common.fleet_folder import FleetFolder, sweep_dead_fleets
 from vtslam.common.settings import Settings
 from vtslam.common.topics import Role
+from vtslam.services.archiver.fleet_record import FleetRecord
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.network import Door
@@ -23,7 +24,7 @@ from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
 from vtslam.services.supervisor.processes import LIVE_SOURCE, processes_of
-from vtslam.services.supervisor.recorder import Recorder
+from vtslam.services.supervisor.progress import FleetProgress
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
 from vtslam.storage.run_folder import RunFolder
@@ -91,17 +92,19 @@ def run_in_fleet(
 
         if resume is not None:
             store.restore(SectionArchive(run).read(resume.section_id), resume.frame, resume.facts.packed())
-        recorder = Recorder(run, store, JournalReader(folder.journal_path), on_frame)
+        # From here on the archiver writes the run folder, until all processes have ended.
+        progress = FleetProgress(run.catalog, JournalReader(folder.journal_path), store, on_frame)
         access = None if door is None else door.access_of(folder.path)
         with Hub(folder.path, fleet, access) as hub, hub.bus(Member(fleet=fleet, role=Role.SUPERVISOR)) as bus:
-            supervisor = _supervisor(bus, fleet, folder, recorder, run, settings, hooks)
+            supervisor = _supervisor(bus, fleet, folder, progress, run, settings, hooks)
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
                 try:
                     interrupted = _supervised(supervisor, bus, hooks)
                 except FleetError:
-                    recorder.finish_broken(seconds=time.perf_counter() - start_s, peak_rss_mb=_peak_rss_mb(supervisor))
+                    record = FleetRecord(run, store, JournalReader(folder.journal_path))
+                    record.finish_broken(seconds=time.perf_counter() - start_s, peak_rss_mb=_peak_rss_mb(supervisor))
                     raise
-        summary = recorder.finish(
+        summary = FleetRecord(run, store, JournalReader(folder.journal_path)).finish(
             finished=not interrupted and supervisor.refusal is None,
             interrupted=interrupted,
             seconds=time.perf_counter() - start_s,
@@ -118,7 +121,7 @@ def _supervisor(
     bus: Bus,
     fleet: str,
     folder: FleetFolder,
-    recorder: Recorder,
+    progress: FleetProgress,
     run: RunFolder,
     settings: Settings,
     hooks: FleetHooks,
@@ -128,19 +131,16 @@ def _supervisor(
     for process in processes:
         folder.reserve_failure(process.name)
 
-    def on_event(text: str) -> None:
-        run.catalog.add_event("restarted", text)
-        hooks.on_event(text)
-
     return Supervisor(
         bus,
         fleet=fleet,
         folder=folder,
         processes=processes,
-        recorder=recorder,
+        progress=progress,
         hang_s=settings.fleet.hang_s,
+        run_lock=run.lock,
         pacing=pace_of(settings.fleet, live=run.read_info().facts.source == LIVE_SOURCE).pacing,
-        on_event=on_event,
+        on_event=hooks.on_event,
         environment=hooks.environment,
     )
 

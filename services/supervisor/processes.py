@@ -24,11 +24,12 @@ class Process:
 SENSOR = Process(name="sensor", role=Role.SENSOR, after=("mapper", "tracker", "recorder"))
 TRACKER = Process(name="tracker", role=Role.TRACKER)
 MAPPER = Process(name="mapper", role=Role.MAPPER)
+ARCHIVER = Process(name="archiver", role=Role.ARCHIVER)
 RECORDER = Process(name="recorder", role=Role.RECORDER)
 
 LIVE_SOURCE = "live:"  # in run.toml: frames come from publishers
 
-PROCESSES = (MAPPER, TRACKER, SENSOR)  # of every fleet
+PROCESSES = (MAPPER, TRACKER, SENSOR, ARCHIVER)  # of every fleet
 
 
 def processes_of(settings: Settings) -> tuple[Process, ...]:

@@ -8,14 +8,22 @@ from vtslam.common.fleet_folder import FleetFolder
 from vtslam.common.messages import Command, Control, ServiceState, ServiceStatus
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
-from vtslam.common.topics import CONTROL, EVERY_SERVICE, MAPPER_COMMITTED, STATUS
+from vtslam.common.topics import (
+    CONTROL,
+    EVERY_SERVICE,
+    FLEET_EVENT,
+    MAPPER_COMMITTED,
+    SECTION_ARCHIVED,
+    SECTION_SEALED,
+    STATUS,
+)
 from vtslam.services.pacing import Pacing
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import ProcessRefused
-from vtslam.services.supervisor.processes import MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, Process
-from vtslam.services.supervisor.recorder import Recorder
-from vtslam.services.supervisor.residency import Residency
+from vtslam.services.supervisor.processes import ARCHIVER, MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, Process
+from vtslam.services.supervisor.progress import FleetProgress
+from vtslam.storage.errors import WriteFailed
 
 _POLL_S = 0.1  # between looks at the processes, when the bus is silent
 
@@ -28,25 +36,27 @@ class _Phase(Enum):
     RUNNING = "running"
     FINISHING = "finishing the rest"  # the sensor has ended
     LAST_ENDING = "ending"  # and so has the second of the other two
-    RECORDING = "recording the rest"  # all have but the recorder, if there is one
+    STORING = "storing the rest"  # all have but the archiver, and the recorder if there is one
     ENDED = "ended"
 
 
 class Supervisor:
-    """Watches the processes of one fleet; a service of its own, whose steps take part in the fleet's work.
+    """Watches the processes of one fleet.
 
     Args:
         bus: A session of the supervisor, in the hub.
         fleet: Name of the fleet.
         folder: The fleet's folder.
-        recorder: Writes the run folder.
+        progress: Told of what is sealed and durable; looked at for frames.
         hang_s: Silence of a work loop that is a hang.
+        run_lock: Of the run folder, handed down to the archiver.
         processes: The processes of the fleet.
         pacing: Who waits for whom; decides who ends after whom.
         on_event: Told, in words, of what the user should know.
         environment: Variables for a process, for tests and experiments.
 
     Attributes:
+        progress: As given.
         refusal: Why the recording could not be read to its end, if so.
     """
 
@@ -56,22 +66,33 @@ class Supervisor:
         *,
         fleet: str,
         folder: FleetFolder,
-        recorder: Recorder,
+        progress: FleetProgress,
         hang_s: float,
+        run_lock: int | None = None,
         processes: Sequence[Process] = PROCESSES,
         pacing: Pacing = Pacing.LOCKSTEP,
         on_event: Callable[[str], None] = lambda text: None,
         environment: Environment = lambda name, epoch: {},
     ) -> None:
-        self._bus, self._folder, self._recorder, self._pacing = bus, folder, recorder, pacing
+        self._bus, self._folder, self.progress, self._pacing = bus, folder, progress, pacing
         self._on_event, self._environment = on_event, environment
         self._children = {
-            process.name: ChildProcess(process, fleet=fleet, folder=folder, hang_s=hang_s) for process in processes
+            process.name: ChildProcess(
+                process,
+                fleet=fleet,
+                folder=folder,
+                hang_s=hang_s,
+                run_lock=run_lock if process.name == ARCHIVER.name else None,
+            )
+            for process in processes
         }
         self._link = ServiceLink(bus, 1)
         self._alive = bus.watch_alive()
         self._heartbeats = bus.subscriber(STATUS, service=EVERY_SERVICE)
         self._commits = bus.subscriber(MAPPER_COMMITTED, newest_only=True)
+        self._sealed = bus.subscriber(SECTION_SEALED)
+        self._archived = bus.subscriber(SECTION_ARCHIVED)
+        self._events = bus.subscriber(FLEET_EVENT)
         self._orders = {name: bus.publisher(CONTROL, service=name) for name in self._children}
         self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
         self._told: set[str] = set()  # processes that were said to wait
@@ -83,11 +104,6 @@ class Supervisor:
         """The processes by name."""
         return self._children
 
-    @property
-    def residency(self) -> Residency:
-        """What the map takes."""
-        return self._recorder.residency
-
     def stop(self) -> None:
         """End the fleet in order: what was published is mapped, the open section sealed. Further calls do nothing."""
         self._link.stopping = True
@@ -97,12 +113,12 @@ class Supervisor:
 
         Raises:
             FleetError: A process cannot be kept alive.
-            StorageError: The run folder cannot be written.
+            WriteFailed: The run folder cannot be written.
         """
         self._listen()
         self._watch()
         self._advance()
-        self._recorder.step(make_room=self._waits_for_memory())
+        self.progress.step()
         if self._phase is _Phase.ENDED:
             self._tell(ServiceState.FINISHED)
             return None
@@ -127,30 +143,36 @@ class Supervisor:
                 child.heard(received.message, 1e-9 * received.arrival_time_ns)
                 self._tell_of(received.message)
         self._commits.receive()  # wakes; what was committed is in the journal
+        while (sealed := self._sealed.receive()) is not None:
+            self.progress.sealed(sealed.message)
+        while (archived := self._archived.receive()) is not None:
+            self.progress.archived(archived.message)
+        while (event := self._events.receive()) is not None:
+            if event.message.service != self._bus.member.name:
+                self._on_event(f"{event.message.service}: {event.message.text}")
 
     def _tell_of(self, status: ServiceStatus) -> None:
         """Tell the user once if a process works, but not as it should."""
         if status.state is ServiceState.DEGRADED and status.service not in self._told:
             self._told.add(status.service)
-            self._on_event(f"{status.service}: waits: {status.detail}")
-
-    def _waits_for_memory(self) -> bool:
-        status = self._children[MAPPER.name].status
-        return status is not None and status.state is ServiceState.DEGRADED
+            self._on_event(f"{status.service}: {status.detail}")
 
     def _watch(self) -> None:
         now_s, names = self._now_s(), self._alive.names()
         for name, child in self._children.items():
             child.seen(on_bus=name in names, now_s=now_s)
             try:
-                event = child.reap(now_s, self._recorder.num_frames)
+                event = child.reap(now_s, self.progress.num_frames)
             except ProcessRefused as refusal:
+                if name == ARCHIVER.name:
+                    raise WriteFailed(str(refusal)) from refusal
                 if name != SENSOR.name:
                     raise
                 self.refusal = refusal  # what was read before is mapped to its end
                 event = None
-            event = event or child.kill_if_hung(now_s, self._recorder.num_frames)
+            event = event or child.kill_if_hung(now_s, self.progress.num_frames)
             if event is not None:
+                self._link.event("restarted", event)
                 self._on_event(event)
 
     def _start_due(self) -> None:
@@ -164,8 +186,8 @@ class Supervisor:
         for name, child in self._children.items():
             self._link.counters[f"{name}.deaths"] = child.deaths
             self._link.counters[f"{name}.hangs"] = child.hangs
-        self._link.gauges["map_peak_mb"] = 1e-6 * self.residency.peak_bytes
-        self._link.tell(state, self._recorder.num_frames - 1, detail=f"{self._pacing}, {self._phase.value}")
+        self._link.gauges["map_peak_mb"] = 1e-6 * self.progress.map_peak_bytes
+        self._link.tell(state, self.progress.num_frames - 1, detail=f"{self._pacing}, {self._phase.value}")
 
     # --- ending -----------------------------------------------------------------------------------------------------
 
@@ -174,7 +196,7 @@ class Supervisor:
 
         Where every frame is mapped, the mapper knows by itself when that is, and needs the tracker until then.
         In realtime the tracker says what was dropped to the last frame, and the mapper takes what there is.
-        A recorder ends when there is nothing new to record.
+        The archiver ends when all is written, a recorder when there is nothing new to record.
         """
         sensor, mapper, tracker = (self._children[process.name] for process in (SENSOR, MAPPER, TRACKER))
         second, last = (tracker, mapper) if self._pacing is Pacing.REALTIME else (mapper, tracker)
@@ -193,12 +215,13 @@ class Supervisor:
             else:
                 self._end(tracker)
             if last.finished:
-                self._phase = _Phase.RECORDING
-        if self._phase is _Phase.RECORDING:
+                self._phase = _Phase.STORING
+        if self._phase is _Phase.STORING:
+            self._order(self._children[ARCHIVER.name], Command.DRAIN)
             recorder = self._children.get(RECORDER.name)
             if recorder is not None:
                 self._end(recorder)
-            if recorder is None or recorder.finished:
+            if all(child.finished for child in self._children.values()):
                 self._phase = _Phase.ENDED
 
     def _end(self, child: ChildProcess) -> None:

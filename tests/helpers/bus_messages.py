@@ -14,6 +14,7 @@ from vtslam.common.messages import (
     Command,
     Control,
     Credit,
+    FleetEvent,
     FrameCommitted,
     FrameCondition,
     FrameDescriptor,
@@ -217,6 +218,10 @@ def _status(rng: np.random.Generator) -> Message:
     return status("mapper", state=_one(rng, ServiceState), counters=counters, gauges={"map_mb": float(rng.normal())})
 
 
+def _event(rng: np.random.Generator) -> Message:
+    return FleetEvent(service="mapper", kind="restarted", text="mapper: started again", time_ns=_id(rng))
+
+
 def _control(rng: np.random.Generator) -> Message:
     return Control(command=_one(rng, Command), through_frame_id=-1, epoch=_id(rng), why="the run is over")
 
@@ -233,5 +238,6 @@ RANDOM: dict[type[Message], Callable[[np.random.Generator], Message]] = {
     SectionRequest: _request,
     SectionReply: _reply,
     ServiceStatus: _status,
+    FleetEvent: _event,
     Control: _control,
 }

@@ -82,7 +82,7 @@ class Disturbance:
         events: What the supervisor told.
         pids: All that were seen.
         children: The processes as their supervisor sees them.
-        map_peak_bytes, map_sealed_bytes: See `Residency`.
+        map_peak_bytes, map_sealed_bytes: See `FleetProgress`.
     """
 
     signals: list[tuple[int, str, signal.Signals]] = field(default_factory=list)
@@ -122,7 +122,7 @@ class Disturbance:
 
     def _step(self, supervisor: Supervisor) -> None:
         self.children = supervisor.children
-        self.map_peak_bytes, self.map_sealed_bytes = supervisor.residency.peak_bytes, supervisor.residency.sealed_bytes
+        self.map_peak_bytes, self.map_sealed_bytes = supervisor.progress.map_peak_bytes, supervisor.progress.map_bytes
         for child in supervisor.children.values():
             if child.pid is not None:
                 self.pids.add(child.pid)

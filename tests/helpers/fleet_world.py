@@ -1,7 +1,9 @@
 """The services of a fleet on the bus in memory: any order of events, and deaths at any message or write."""
 
+import contextlib
+import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,29 +21,34 @@ from vtslam.common.external_pose import ExternalPose
 from vtslam.common.fleet_folder import shared_memory_folder
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.common.messages import Command, Control
+from vtslam.common.messages import Command, Control, ServiceState
 from vtslam.common.preset_loading import load_settings
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.shm.map_store import MapStore
 from vtslam.common.splat.native_engine import NativeEngine
-from vtslam.common.topics import CONTROL, Role
+from vtslam.common.topics import CONTROL, EVERY_SERVICE, STATUS, Role
+from vtslam.services.archiver.service import ArchiverService
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.map_follower import MapFollower, StoreArchive
 from vtslam.services.mapper.service import FleetPaths, MapperService
 from vtslam.services.pacing import Pace
+from vtslam.services.section_loader import SectionLoader
 from vtslam.services.section_map import ReadsSections
 from vtslam.services.sensor.service import RecordingSensor
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.system import System
 from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.service import TrackerService
+from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.run_info import RunFacts, RunInfo
+from vtslam.storage.section_convert import SectionArchive
 
 FRAMES, SIZE = 5, (20, 15)
 TIMEOUT_S = 600.0  # simulated
 
 
-def settings_of(section_length: int, *, length_m: float = 0.0) -> Settings:
+def settings_of(section_length: int, *assignments: str, length_m: float = 0.0) -> Settings:
     """Of a small map."""
     return load_settings(
         preset="fast",
@@ -53,11 +60,27 @@ def settings_of(section_length: int, *, length_m: float = 0.0) -> Settings:
             "mapper.iterations_regular=1",
             "mapper.iterations_seal=1",
             "mapper.keep_moments=true",
+            *assignments,
         ],
     )
 
 
 SETTINGS = settings_of(2)
+LOAD_TIMEOUT_S = 5.0  # simulated
+RUN_INFO = RunInfo(
+    facts=RunFacts(
+        created_by="test",
+        source="few:",
+        family="tum",
+        preset="fast",
+        width=SIZE[0],
+        height=SIZE[1],
+        first_frame=0,
+        end_frame=0,
+    ),
+    settings={},
+    versions={},
+)
 ENGINE = NativeEngine(threads=1)
 
 
@@ -108,12 +131,12 @@ class Sections(ReadsSections):
         return self.written[section_id]
 
 
-@lru_cache(maxsize=1)
-def expected() -> Result:
+@lru_cache(maxsize=2)
+def expected(settings: Settings = SETTINGS, frames: int = FRAMES) -> Result:
     """The result of one process."""
-    sections, source = Sections(), FewFrames()
-    system = System(SETTINGS, ENGINE, sections, threads=1)
-    reports = [system.process(source.frame(index)) for index in range(FRAMES)]
+    sections, source = Sections(), FewFrames(frames)
+    system = System(settings, ENGINE, sections, threads=1)
+    reports = [system.process(source.frame(index)) for index in range(frames)]
     system.finish()
     return Result(
         tuple(section_bytes(section) for section in sections.written.values()),
@@ -122,7 +145,7 @@ def expected() -> Result:
 
 
 @dataclass(slots=True)
-class _Watched:
+class Watched:
     """A service whose end is noted, as a supervisor notes that of a process."""
 
     name: str
@@ -136,21 +159,43 @@ class _Watched:
         return patience_s
 
 
+@dataclass(slots=True)
+class Slow:
+    """A service whose working steps take a while, in which it neither hears nor does anything."""
+
+    steps: Steps
+    seconds: float
+    bus: Bus
+    busy_until_ns: int = 0
+
+    def step(self) -> float | None:
+        left_ns = self.busy_until_ns - self.bus.clock.monotonic_ns()
+        if left_ns > 0:
+            return 1e-9 * left_ns
+        patience_s = self.steps.step()
+        if patience_s == 0.0 and self.seconds > 0.0:
+            self.busy_until_ns = self.bus.clock.monotonic_ns() + int(1e9 * self.seconds)
+            return self.seconds
+        return patience_s
+
+
 class _Conductor:
     """Ends the fleet in order, as its supervisor does."""
 
     def __init__(self, bus: Bus, epochs: dict[str, int], ended: set[str], last_frame_id: int) -> None:
         self._epochs, self._ended, self._last = epochs, ended, last_frame_id
         self._ordered: set[tuple[str, int]] = set()
-        self._orders = {name: bus.publisher(CONTROL, service=name) for name in ("mapper", "tracker")}
+        self._orders = {name: bus.publisher(CONTROL, service=name) for name in epochs}
 
     def step(self) -> float | None:
-        if "tracker" in self._ended:
+        if self._ended == self._epochs.keys():
             return None
         if "sensor" in self._ended:
             self._order("mapper", Command.DRAIN)
         if "mapper" in self._ended:
             self._order("tracker", Command.STOP)
+            if "archiver" in self._epochs:
+                self._order("archiver", Command.DRAIN)
         return 0.1
 
     def _order(self, name: str, command: Command) -> None:
@@ -160,15 +205,41 @@ class _Conductor:
             self._orders[name].publish(Control(command=command, through_frame_id=self._last, epoch=epoch))
 
 
+class _Observer:
+    """Keeps what services say that do not work as they should."""
+
+    def __init__(self, bus: Bus, degraded: dict[str, str], ended: set[str], services: int) -> None:
+        self._statuses = bus.subscriber(STATUS, service=EVERY_SERVICE)
+        self._degraded, self._ended, self._num_services = degraded, ended, services
+
+    def step(self) -> float | None:
+        while (received := self._statuses.receive()) is not None:
+            if received.message.state is ServiceState.DEGRADED:
+                self._degraded[received.message.service] = received.message.detail
+        return None if len(self._ended) == self._num_services else 0.5
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stream:
-    """What goes through a fleet: frames of a closed path of ``path`` ones, how they are mapped, and at which pace."""
+    """What goes through a fleet: frames of a closed path of ``path`` ones, how they are mapped, and at which pace.
+
+    Sections stay in memory unless there is an archiver.
+    """
 
     frames: int = FRAMES
     path: int = 48
     size: tuple[int, int] = SIZE
     settings: Settings = SETTINGS
     pace: Pace = field(default_factory=Pace)
+    archiver: "Archiving | None" = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Archiving:
+    """A fleet with an archiver, in so much memory; its steps that do something take some simulated seconds."""
+
+    budget_bytes: int
+    step_s: float = 0.0
 
 
 class FleetWorld:
@@ -189,26 +260,38 @@ class FleetWorld:
         self._source = FewFrames(stream.frames, stream.path, stream.size)
         self.world = MemoryWorld(schedule, kills=kills)
         self._folder = folder
-        self._store = MapStore(folder / "map", budget_bytes=1 << 30, pins=24)
+        self._archiving = stream.archiver
+        budget_bytes = 1 << 30 if stream.archiver is None else stream.archiver.budget_bytes
+        self._store = MapStore(folder / "map", budget_bytes=budget_bytes, pins=24)
         self._ended: set[str] = set()
-        self._epochs = {name: 0 for name in ("sensor", "tracker", "mapper")}
-        for role, start in ((Role.SENSOR, self._sensor), (Role.TRACKER, self._tracker), (Role.MAPPER, self._mapper)):
+        starts = {Role.SENSOR: self._sensor, Role.TRACKER: self._tracker, Role.MAPPER: self._mapper}
+        if stream.archiver is not None:
+            starts[Role.ARCHIVER] = self._archiver
+            self._run = RunFolder.create(folder / "run", RUN_INFO)
+        self._epochs = {role.value: 0 for role in starts}
+        self.counters: dict[str, list[dict[str, int]]] = {role.value: [] for role in starts}  # of each start
+        self.degraded: dict[str, str] = {}  # what a service said when it did not work as it should
+        for role, start in starts.items():
             self._add(role, start)
         self.world.add_service(
             Member(fleet="test", role=Role.SUPERVISOR),
             lambda bus: _Conductor(bus, self._epochs, self._ended, len(self._source) - 1),
         )
+        if stream.archiver is not None:
+            self.world.add_service(Member(fleet="test", role=Role.OBSERVER), self._observer)
 
     def _add(self, role: Role, start: Callable[[Bus], Steps]) -> None:
         def watched(bus: Bus) -> Steps:
-            return _Watched(role.value, start(bus), self._ended)
+            return Watched(role.value, start(bus), self._ended)
 
-        self.world.add_service(Member(fleet="test", role=role), watched)
+        # Whoever asks an archiver while it is started again reads the file instead: that should not be all of them.
+        restart_s = 0.0 if role is Role.ARCHIVER else 0.1
+        self.world.add_service(Member(fleet="test", role=role), watched, restart_s=restart_s)
 
     def run(self) -> Result:
         """Let the fleet run to its end."""
         assert self.world.run(timeout_s=TIMEOUT_S), f"no end; deaths {self.world.deaths}"
-        sections = [self._store.pinned_sealed(section_id).section.retied() for section_id in self._store.sealed_ids()]
+        sections = self._sections()
         frames = {line.frame.facts.frame_id: line.frame for line in JournalReader(self._folder / "journal").new_lines()}
         assert sorted(frames) == list(range(len(self._source)))
         return Result(
@@ -216,23 +299,64 @@ class FleetWorld:
             tuple(frames[index].T_world_camera.tobytes() for index in range(len(self._source))),
         )
 
+    def close(self) -> None:
+        """Give everything back."""
+        self.world.close()
+        if self._archiving is not None:
+            self._run.close()
+
+    def events(self) -> list[str]:
+        """What the archiver noted."""
+        return [event.text for event in self._run.catalog.events()]
+
+    def _sections(self) -> list[Section]:
+        if self._archiving is None:
+            return [self._store.pinned_sealed(i).section.retied() for i in self._store.sealed_ids()]
+        run = RunFolder.open(self._run.path)
+        return [SectionArchive(run).read(row.section_id) for row in run.catalog.sections()]
+
+    def _archive(self, bus: Bus, link: ServiceLink) -> StoreArchive:
+        if self._archiving is None:
+            return StoreArchive(self._store, Sections())
+        loader = SectionLoader(bus, link, timeout_s=LOAD_TIMEOUT_S)
+        return StoreArchive(self._store, SectionArchive(RunFolder.open(self._run.path)), load=loader.load)
+
+    def _observer(self, bus: Bus) -> Steps:
+        return _Observer(bus, self.degraded, self._ended, len(self._epochs))
+
+    def _archiver(self, bus: Bus) -> Steps:
+        assert self._archiving is not None
+        assert self._run.lock is not None
+        link = self._link(bus)
+        run = RunFolder.open(self._run.path, writable=True, lock=os.dup(self._run.lock))
+        journal = JournalReader(self._folder / "journal")
+        service = ArchiverService(bus, link, self._settings, self._store, run, journal)
+        return Slow(service, self._archiving.step_s, bus)
+
     def _link(self, bus: Bus) -> ServiceLink:
         self._epochs[bus.member.name] += 1
-        return ServiceLink(bus, self._epochs[bus.member.name])
+        link = ServiceLink(bus, self._epochs[bus.member.name])
+        self.counters[bus.member.name].append(link.counters)
+        return link
+
+    def count(self, service: str, what: str) -> int:
+        """What all starts of a service counted together."""
+        return sum(counters.get(what, 0) for counters in self.counters[service])
 
     def _sensor(self, bus: Bus) -> Steps:
         return RecordingSensor(bus, self._link(bus), self._source, self._folder / "ring", credit=self._pace.credit)
 
     def _tracker(self, bus: Bus) -> Steps:
+        link = self._link(bus)
         follower = MapFollower(
             self._store,
-            StoreArchive(self._store, Sections()),
+            self._archive(bus, link),
             candidate_interval=self._settings.section.candidate_interval,
         )
         core = Tracker(settings=self._settings.tracker, engine=ENGINE, threads=1)
         return TrackerService(
             bus,
-            self._link(bus),
+            link,
             core,
             follower,
             self._folder / "ring",
@@ -241,13 +365,14 @@ class FleetWorld:
         )
 
     def _mapper(self, bus: Bus) -> Steps:
+        link = self._link(bus)
         return MapperService(
             bus,
-            self._link(bus),
+            link,
             self._settings,
             ENGINE,
             self._store,
-            StoreArchive(self._store, Sections()),
+            self._archive(bus, link),
             FleetPaths(ring=self._folder / "ring", journal=self._folder / "journal"),
             self._pace,
         )
@@ -257,10 +382,22 @@ def run_world(
     schedule: Schedule, kills: Kills | None = None, *, stream: Stream | None = None
 ) -> tuple[Result, MemoryWorld]:
     """A whole run in a folder of its own; points within writes to shared memory count as points of the world."""
-    with tempfile.TemporaryDirectory(dir=shared_memory_folder()) as name, pytest.MonkeyPatch.context() as patch:
+    with fleet_world(schedule, kills, stream=stream) as fleet:
+        return fleet.run(), fleet.world
+
+
+@contextlib.contextmanager
+def fleet_world(
+    schedule: Schedule, kills: Kills | None = None, *, stream: Stream | None = None
+) -> Iterator[FleetWorld]:
+    """The world of :func:`run_world`, to look at it afterwards."""
+    with (
+        tempfile.TemporaryDirectory(prefix="vts-", dir=shared_memory_folder()) as name,
+        pytest.MonkeyPatch.context() as patch,
+    ):
         fleet = FleetWorld(Path(name), schedule, kills, stream=stream)
         patch.setattr(failpoints, "reach", fleet.world.point)
         try:
-            return fleet.run(), fleet.world
+            yield fleet
         finally:
-            fleet.world.close()
+            fleet.close()

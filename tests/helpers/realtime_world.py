@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from helpers.fleet_world import ENGINE, FewFrames, Sections
+from helpers.fleet_world import ENGINE, FewFrames, Sections, Slow, Watched
 
 from vtslam.common.bus import Bus, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld
@@ -25,30 +25,6 @@ from vtslam.services.tracker.realtime import RealtimeTracker
 RATE_HZ = 60.0
 _TIMEOUT_S = 600.0  # simulated
 _ORDER = ("sensor", "tracker", "mapper")
-
-
-@dataclass(slots=True)
-class _Slow:
-    """A service whose working steps take a while, in which it neither hears nor does anything."""
-
-    name: str
-    steps: Steps
-    seconds: float
-    bus: Bus
-    ended: set[str]
-    busy_until_ns: int = 0
-
-    def step(self) -> float | None:
-        left_ns = self.busy_until_ns - self.bus.clock.monotonic_ns()
-        if left_ns > 0:
-            return 1e-9 * left_ns
-        patience_s = self.steps.step()
-        if patience_s is None:
-            self.ended.add(self.name)
-        elif patience_s == 0.0 and self.seconds > 0.0:
-            self.busy_until_ns = self.bus.clock.monotonic_ns() + int(1e9 * self.seconds)
-            return self.seconds
-        return patience_s
 
 
 class _Conductor:
@@ -163,7 +139,8 @@ class RealtimeWorld:
         def start(bus: Bus) -> Steps:
             self._epochs[role.value] += 1
             link = ServiceLink(bus, self._epochs[role.value])
-            return _Slow(role.value, make(bus, link), self._seconds.get(role.value, 0.0), bus, self._ended)
+            slow = Slow(make(bus, link), self._seconds.get(role.value, 0.0), bus)
+            return Watched(role.value, slow, self._ended)
 
         self.world.add_service(Member(fleet="test", role=role), start)
 

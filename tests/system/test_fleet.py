@@ -1,6 +1,5 @@
 """A fleet of processes leaves what one process leaves, whichever of them dies and whenever."""
 
-import re
 import signal
 import socket
 from pathlib import Path
@@ -17,7 +16,6 @@ from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_resume, plan_run
 from vtslam.services.sensor.sources.base import SourceError
-from vtslam.services.supervisor import residency
 from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.run_folder import RunFolder
 
@@ -32,7 +30,7 @@ def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_
     assert result_bytes(tmp_path / "run") == small.undisturbed
     assert (summary.frames, summary.sections, summary.interrupted) == (FRAMES, 4, False)
     assert calm.events == []
-    assert len(calm.pids) == 3
+    assert len(calm.pids) == 4
     assert all(is_gone(pid) for pid in calm.pids)
     with RunFolder.open(tmp_path / "run") as run:
         assert run.read_info().facts.finished
@@ -76,7 +74,7 @@ def test_prometheus_is_answered_on_this_host_while_the_fleet_runs(small: SmallRe
 
 
 def test_processes_that_are_killed_twice_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
-    names = ("sensor", "tracker", "mapper")
+    names = ("sensor", "tracker", "mapper", "archiver")
     moments = [*enumerate(names, 2), *enumerate(names, SECTION + 2)]
     killed = Disturbance(signals=[(frames, name, KILL) for frames, name in moments])
     fleet_run(small.files, tmp_path / "run", killed)
@@ -99,28 +97,18 @@ def test_priors_of_poses_are_used_and_outlive_processes(small: SmallRecording, t
 
 
 def test_sections_leave_memory_within_the_budget_and_are_read_again(small: SmallRecording, tmp_path: Path) -> None:
-    plan = small_plan(small.files, "section.length=2", "tracker.overlap.max_sections=5", "fleet.map_budget_mb=3")
+    plan = small_plan(small.files, "section.length=2", "tracker.overlap.max_sections=5", "fleet.map_budget_mb=4")
     plan.execute(tmp_path / "one")
     calm = Disturbance()
     plan.execute_in_fleet(tmp_path / "many", calm.hooks())
 
     assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
-    assert calm.children["tracker"].counters["sections.reloaded"] > 0
-    assert 0 < calm.map_peak_bytes <= 3_000_000
-
-
-def test_a_map_that_fills_its_memory_waits_for_the_disk(
-    small: SmallRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(residency, "_MARGIN", 0.0)  # nothing leaves before the mapper asks for room
-    plan = small_plan(small.files, "source.size=200x150", "source.frames=0:8", *LARGE_MAP)
-    plan.execute(tmp_path / "one")
-    calm = Disturbance()
-    plan.execute_in_fleet(tmp_path / "many", calm.hooks())
-
-    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
-    assert len(calm.events) == 1
-    assert re.match(r"mapper: waits: .* \d+ of the map store's 16000000 bytes are in use", calm.events[0])
+    counters = calm.children["archiver"].counters
+    assert counters["sections.reloaded"] > 0
+    assert counters["sections.archived"] == FRAMES // 2
+    assert calm.map_sealed_bytes > 0
+    assert 0 < calm.map_peak_bytes <= 4_000_000
+    assert calm.events == []
 
 
 def test_a_map_that_cannot_fit_ends_the_fleet_in_order(small: SmallRecording, tmp_path: Path) -> None:
@@ -149,15 +137,39 @@ def test_deaths_within_writes_to_shared_memory_change_nothing(small: SmallRecord
     fleet_run(small.files, tmp_path / "run", killed)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert (killed.deaths["mapper"], killed.deaths["sensor"], killed.deaths["tracker"]) == (6, 2, 0)
+    assert killed.deaths == {"mapper": 6, "sensor": 2, "tracker": 0, "archiver": 0}
+
+
+def test_deaths_within_writes_to_the_run_folder_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
+    words = ("source.frames=0:10", "section.length=2", "storage.codec='dense'")
+    points = {
+        ("archiver", 1): "run.section.after_write:2",
+        ("archiver", 2): "run.section.after_catalog:1",
+        ("archiver", 3): "run.section.after_trajectory:1",
+    }
+    plan = small_plan(small.files, *words)
+    plan.execute(tmp_path / "one")
+    killed = Disturbance(failpoints=points)
+    plan.execute_in_fleet(tmp_path / "many", killed.hooks())
+
+    assert result_bytes(tmp_path / "many") == result_bytes(tmp_path / "one")
+    assert killed.deaths == {"mapper": 0, "sensor": 0, "tracker": 0, "archiver": len(points)}
+    assert sorted(path.name for path in (tmp_path / "many").iterdir()) == sorted(
+        path.name for path in (tmp_path / "one").iterdir()
+    )
+    with RunFolder.open(tmp_path / "many") as run:
+        told = [event.text for event in run.catalog.events() if event.kind == "restarted"]
+        assert {row.codec for row in run.catalog.sections()} == {"dense"}
+    assert told == [event for event in killed.events if "killed by signal 9" in event]
+    assert len(told) == len(points)
 
 
 def test_all_processes_killed_at_once_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
-    killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper")])
+    killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper", "archiver")])
     fleet_run(small.files, tmp_path / "run", killed)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert killed.deaths == {"sensor": 1, "tracker": 1, "mapper": 1}
+    assert killed.deaths == {"sensor": 1, "tracker": 1, "mapper": 1, "archiver": 1}
 
 
 def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording, tmp_path: Path) -> None:
@@ -165,7 +177,7 @@ def test_a_process_that_hangs_is_killed_and_started_again(small: SmallRecording,
     fleet_run(small.files, tmp_path / "run", stopped)
 
     assert result_bytes(tmp_path / "run") == small.undisturbed
-    assert stopped.hangs == {"sensor": 0, "tracker": 1, "mapper": 0}
+    assert stopped.hangs == {"sensor": 0, "tracker": 1, "mapper": 0, "archiver": 0}
     assert len(stopped.events) == 1
     assert stopped.events[0].startswith("tracker: left the bus while it ran after ")
 

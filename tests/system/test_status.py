@@ -25,11 +25,11 @@ def test_status_shows_each_service_of_a_running_fleet(tmp_path: Path, capsys: py
         process.communicate()
 
     services = json.loads(found.read_text())[fleet]
-    assert set(services) == {"mapper", "sensor", "supervisor", "tracker"}
+    assert set(services) == {"archiver", "mapper", "sensor", "supervisor", "tracker"}
     assert all(each["alive"] and each["starts"] == 1 for each in services.values())
     assert services["mapper"]["counters"]["frames.committed"] >= 3
     assert services["supervisor"]["counters"]["tracker.deaths"] == 0
-    assert f"fleet {fleet}\n  mapper       alive" in capsys.readouterr().out
+    assert f"fleet {fleet}\n  archiver     alive" in capsys.readouterr().out
 
 
 def test_status_of_a_fleet_that_is_not_there_fails(capsys: pytest.CaptureFixture[str]) -> None:

@@ -174,7 +174,7 @@ class TestBus:
         assert publisher.publish(descriptor(0)) == 0
 
     def test_questions_are_answered_refused_or_time_out(self, backend: Backend) -> None:
-        tracker, mapper = backend.join(Role.TRACKER), backend.join(Role.MAPPER)
+        tracker, mapper = backend.join(Role.TRACKER), backend.join(Role.ARCHIVER)
         request = SectionRequest(section_id=4, reader="tracker")
         with pytest.raises(NoReply, match="section/load"):
             tracker.get(SECTION_LOAD, request, timeout_s=0.2)
@@ -192,7 +192,7 @@ class TestBus:
             tracker.get(SECTION_LOAD, request, timeout_s=0.2)
 
     def test_open_questions_end_when_the_answering_side_closes(self, backend: Backend) -> None:
-        tracker, mapper = backend.join(Role.TRACKER), backend.join(Role.MAPPER)
+        tracker, mapper = backend.join(Role.TRACKER), backend.join(Role.ARCHIVER)
         queryable = mapper.queryable(SECTION_LOAD)
         request = SectionRequest(section_id=4, reader="tracker")
         for _ in range(100):

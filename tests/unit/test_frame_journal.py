@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vtslam.common.messages import TrackerHistory
+from vtslam.common.messages import SectionArchived, TrackerHistory
 from vtslam.common.shm.errors import SharedMemoryFull
+from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_facts import CommittedFrame, FrameFacts
 from vtslam.services.frame_journal import JournalReader, JournalWriter
+from vtslam.services.supervisor.progress import FleetProgress
+from vtslam.storage.catalog import Catalog
 
 LENGTH = 3
 
@@ -144,3 +147,21 @@ def test_facts_survive_exactly() -> None:
     assert again.packed() == facts.packed()
     assert again.T_world_previous is not None
     assert again.T_world_previous.tobytes() == np.full((4, 4), 1 / 3).tobytes()
+
+
+def test_lines_are_deleted_once_they_are_durable_and_counted(tmp_path: Path) -> None:
+    writer, seen = JournalWriter(tmp_path / "journal"), list[int]()
+    catalog, store = Catalog.create(tmp_path / "catalog.sqlite"), MapStore(tmp_path / "map", budget_bytes=1 << 20)
+    journal = JournalReader(tmp_path / "journal")
+    progress = FleetProgress(catalog, journal, store, lambda facts: seen.append(facts.frame_id))
+    append(writer, 0, 1, 1, 2, 2, 3)
+    digest = "0" * 64
+    progress.archived(SectionArchived(section_id=0, file_name="000000.vts", file_bytes=1, sha256=digest, epoch=1))
+    progress.step()
+
+    assert (seen, progress.num_frames) == ([0, 1, 2, 3], 4)
+    assert sorted(path.name for path in (tmp_path / "journal").iterdir()) == ["000001"]
+    append(writer, 3, 4)
+    progress.step()
+    assert seen == [0, 1, 2, 3, 4]
+    catalog.close()

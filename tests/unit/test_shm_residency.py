@@ -3,6 +3,7 @@ import numpy as np
 from vtslam.common.shm.residency import (
     Admission,
     ResidentFacts,
+    ViewPlaces,
     make_room,
     predicted_position_m,
     to_prefetch,
@@ -53,9 +54,14 @@ def test_ties_in_time_are_broken_by_id() -> None:
 
 
 def test_sections_near_the_predicted_position_nearest_first() -> None:
-    heads = {i: np.array([float(i), 0.0, 0.0]) for i in range(10)}
-    ahead = predicted_position_m(heads[3], heads[4], frames_ahead=2)
+    at_m = np.stack([np.arange(20) / 2.0, np.zeros(20), np.zeros(20)], axis=1)  # two views a section
+    looks = np.tile([0.0, 0.0, 1.0], (20, 1))
+    looks[14:16] = [0.0, 0.0, -1.0]
+    places = ViewPlaces(section_ids=np.arange(20) // 2, positions_m=at_m, directions=looks)
+    ahead = predicted_position_m(at_m[6], at_m[8], frames_ahead=2)
     assert ahead.tolist() == [6.0, 0.0, 0.0]
-    assert wanted_soon(heads, ahead, radius_m=1.5, at_most=10) == [6, 5, 7]
-    assert wanted_soon(heads, ahead, radius_m=1.5, at_most=1) == [6]
+    along = np.array([0.0, 0.0, 1.0])
+    assert wanted_soon(places, ahead, along, radius_m=1.2, at_most=10) == [6, 5]  # 7 looks back
+    assert wanted_soon(places, ahead, -along, radius_m=1.2, at_most=10) == [7]
+    assert wanted_soon(places, ahead, along, radius_m=1.2, at_most=1) == [6]
     assert to_prefetch([6, 5, 7], resident=[5], loading=[7]) == [6]
