@@ -339,13 +339,39 @@ class RecorderSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ViewerSettings:
+    """What is shown of a run while it lasts, by a process that nobody waits for; results do not depend on it.
+
+    Attributes:
+        web_port: Where 127.0.0.1 answers browsers; the page's data come from the port after it. 0 for nowhere.
+        save: A file (.rrd) to keep what is shown in; empty for none.
+        idle: Run only where nobody else wants to; on a machine without time to spare, it then shows next to nothing.
+        cpu_share: Of one core, that the viewer takes at most over time.
+        section_gaussians: Gaussians of a section that are sent at most ...
+        gaussians: ... and of all sections together; beyond a fifth of that, they are sent as points.
+    """
+
+    web_port: Annotated[int, Range(0, 65534)] = 0
+    save: str = ""
+    idle: bool = True
+    cpu_share: Annotated[float, Range(0.001, 1.0)] = 0.2
+    section_gaussians: Annotated[int, Range(100, 10**7)] = 20_000
+    gaussians: Annotated[int, Range(1000, 10**8)] = 2_000_000
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether there is to be a viewer."""
+        return self.web_port > 0 or self.save != ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """All settings of a run.
 
     Attributes:
         seed: Key of every random choice.
         holdout: Every so many regular frames one is tracked but kept out of mapping; 0 none.
-        source, splat, section, tracker, mapper, storage, fleet, archiver, recorder: The parts.
+        source, splat, section, tracker, mapper, storage, fleet, archiver, recorder, viewer: The parts.
     """
 
     seed: Annotated[int, Range(0, 2**31)] = 2
@@ -359,3 +385,4 @@ class Settings:
     fleet: FleetSettings = field(default_factory=FleetSettings)
     archiver: ArchiverSettings = field(default_factory=ArchiverSettings)
     recorder: RecorderSettings = field(default_factory=RecorderSettings)
+    viewer: ViewerSettings = field(default_factory=ViewerSettings)

@@ -44,11 +44,14 @@ class Role(StrEnum):
     MAPPER = "mapper"
     ARCHIVER = "archiver"
     RECORDER = "recorder"
+    VIEWER = "viewer"  # shows what there is; publishes how it is, and nothing else
     REMOTE_SENSOR = "remote_sensor"  # publishes pixels, usually from another host
-    OBSERVER = "observer"  # reads only: robots, viewers, `vtslam status`
+    OBSERVER = "observer"  # reads only: robots, `vtslam status`
 
 
-SERVICES = frozenset({Role.SUPERVISOR, Role.SENSOR, Role.TRACKER, Role.MAPPER, Role.ARCHIVER, Role.RECORDER})
+SERVICES = frozenset(
+    {Role.SUPERVISOR, Role.SENSOR, Role.TRACKER, Role.MAPPER, Role.ARCHIVER, Role.RECORDER, Role.VIEWER}
+)
 
 
 class Overflow(StrEnum):

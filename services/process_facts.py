@@ -1,5 +1,6 @@
 """What a process can say of itself (memory, the versions its results may depend on), and of other processes."""
 
+import contextlib
 import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -55,6 +56,17 @@ def cpu_seconds(pid: int) -> float:
     except OSError:
         return 0.0
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def yield_to_others() -> None:
+    """Let this process and what it starts run only where nobody else wants to: nice 19, SCHED_IDLE, lowest autogroup.
+
+    Threads that there are already keep theirs.
+    """
+    os.nice(19)
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    with contextlib.suppress(OSError):  # not every kernel has groups; where they are, nice counts within one only
+        Path("/proc/self/autogroup").write_text("19")
 
 
 def _status_mb(path: Path, key: str) -> float:

@@ -1,6 +1,7 @@
 """Reading the active section: one generation, pinned (docs/protocol-shm.md, section 5)."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.frame import Frame
+from vtslam.common.shm._atomics import fence
 from vtslam.common.shm.active_layout import (
     APPENDED,
     CONTROL,
@@ -19,7 +21,7 @@ from vtslam.common.shm.active_layout import (
     read_record,
 )
 from vtslam.common.shm.blocks import ControlPage, Kind, State, mapped, open_file
-from vtslam.common.shm.errors import GenerationGone, SectionNotResident
+from vtslam.common.shm.errors import DamagedBlock, GenerationGone, SectionNotResident
 from vtslam.common.shm.pins import Pin
 from vtslam.common.shm.records import ActiveState, AttributeMoments, SectionMoments
 from vtslam.common.shm.section_columns import LEARNED_COLUMNS, TRAINED
@@ -77,6 +79,37 @@ class ActiveReader:
         except BaseException:
             pin.release()
             raise
+
+    def copied(self) -> ActiveState:
+        """The last commit without optimiser state, its learned columns copied; images and ties never change.
+
+        Takes no pin, so that a reader that stops for good in the middle of this holds up nobody.
+
+        Raises:
+            SectionNotResident: As :meth:`pinned`.
+            GenerationGone: The writer needed the buffer meanwhile; the next try may fare better.
+        """
+        state = self._control.state
+        if state.number == 0:
+            raise SectionNotResident(f"{self._folder}: nothing was committed yet")
+        learned = self._mapped(learned_name(state.buffer), self._layout.learned.file_bytes)
+        gone = GenerationGone(f"{self._folder}: generation {state.number} was overwritten while it was copied")
+        try:
+            record, facts = read_record(self._folder, learned)
+            active = self._active_state(learned, record, facts, with_moments=False)
+            section = replace(active.section, gaussians=active.section.gaussians.copied())
+        except DamagedBlock:
+            if self._is_kept(state):
+                raise
+            raise gone from None
+        fence()  # the columns were copied before the state is looked at again
+        if not self._is_kept(state):
+            raise gone
+        return replace(active, section=section)
+
+    def _is_kept(self, state: State) -> bool:
+        """Whether the writer has left a state's buffer alone up to now."""
+        return self.generation - state.number < max(self._layout.kept, 1)
 
     def _pinned_state(self, entry: int, generation: int | None) -> State:
         if generation is None:

@@ -22,7 +22,14 @@ from vtslam.common.shm.errors import (
 )
 from vtslam.common.shm.process_identity import is_alive, own_identity
 from vtslam.common.shm.records import ActiveSpec, LastCommit
-from vtslam.common.shm.sealed_block import PinnedSealed, read_tail, sealed_pin_holders, write_sealed, write_tail
+from vtslam.common.shm.sealed_block import (
+    PinnedSealed,
+    read_sealed,
+    read_tail,
+    sealed_pin_holders,
+    write_sealed,
+    write_tail,
+)
 
 _NAME = re.compile(r"(active|sealed|tail)-(\d+)")
 _LEFTOVER = re.compile(r"\.(?:new|old)-([0-9a-f]+)-.+")
@@ -131,6 +138,20 @@ class MapStore:
     def active_reader(self, section_id: int) -> ActiveReader:
         """The active section, mapped once for many pins; raises SectionNotResident, DamagedBlock."""
         return ActiveReader(self._path("active", section_id))
+
+    def copied_sealed(self, section_id: int) -> Section:
+        """A copy of a sealed section, for readers that nobody shall wait for; raises as `read_sealed`."""
+        return read_sealed(self._path("sealed", section_id))
+
+    def last_sealed_commit(self) -> LastCommit | None:
+        """What was committed last to a sealed section, without a look at the active one; None if nothing was.
+
+        Raises:
+            SectionNotResident: It was replaced at this moment.
+            DamagedBlock: See `read_tail`.
+        """
+        tails = self._ids("tail")
+        return read_tail(self._path("tail", tails[-1])) if tails else None
 
     # --- writing ----------------------------------------------------------------------------------------------------
 

@@ -161,6 +161,26 @@ class PinnedSealed:
         self._pin.release()
 
 
+def read_sealed(path: Path) -> Section:
+    """A copy of a finished section without positions and surface; takes no pin, and does not count as use.
+
+    The payload never changes, and a block that leaves memory meanwhile is unlinked only: what is mapped stays.
+
+    Raises:
+        SectionNotResident, DamagedBlock: As `PinnedSealed`.
+    """
+    try:
+        fd = open_file(path, writable=True)
+    except FileNotFoundError as error:
+        raise SectionNotResident(f"{path}: not in the map store") from error
+    try:
+        control = ControlPage.open(path, fd, Kind.SEALED)
+        data = mapped(fd, control.file_bytes - CONTROL_BYTES, offset=CONTROL_BYTES, writable=False).copy()
+    finally:
+        os.close(fd)
+    return _sealed_section(control.description(_SEALED), data)
+
+
 def sealed_pin_holders(path: Path) -> list[int]:
     """Pids of living processes that have a sealed section pinned; none if it is not there."""
     try:

@@ -7,6 +7,8 @@ SOURCE_HELP = (
     "where frames come from: replica:DIR, 7scenes:DIR, tum:DIR, scannet:DIR|FILE.sens, scannetpp:DIR, "
     "realsense:, kitti:DIR, mcap:FILE, sim:room, sim:city"
 )
+WEB_PORT = 9090
+VIEW_ASSIGNMENT = f"viewer.web_port={WEB_PORT}"  # what --view stands for
 _JSON_HELP = "write the result as JSON (- for standard output)"
 
 
@@ -25,6 +27,7 @@ def parser() -> argparse.ArgumentParser:
     _add_publish(commands)
     _add_record(commands)
     _add_status(commands)
+    _add_view(commands)
     _add_eval(commands)
     _add_sections(commands)
     _add_bench(commands)
@@ -83,6 +86,7 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     _add_pacing(command, default="lockstep")
     _add_recording(command)
+    _add_viewing(command)
     _add_poses(command)
     _add_layers(command)
     _add_source_shorthands(command)
@@ -101,6 +105,7 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
     _add_pacing(command, default="realtime")
     _add_recording(command)
+    _add_viewing(command)
     command.add_argument("--listen", metavar="HOST:PORT", help="let other hosts in here; needs --access")
     command.add_argument("--access", type=Path, metavar="FILE", help="who may come in (TOML, see deploy/runbook.md)")
     _add_layers(command)
@@ -142,6 +147,24 @@ def _add_status(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("--fleet", metavar="NAME", help="this fleet (default: all of this user)")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
+
+
+def _add_view(commands: "_Commands[argparse.ArgumentParser]") -> None:
+    command = _command(
+        commands,
+        "view",
+        "look at a finished run, or at a running fleet: map, camera, images, figures",
+        example="vtslam view RUN --web\n  vtslam view --live --save kitchen.rrd\n  vtslam view RUN --film film.webp",
+    )
+    command.add_argument("run", nargs="?", type=Path, metavar="RUN", help="a run folder")
+    command.add_argument("--live", action="store_true", help="a running fleet instead")
+    command.add_argument("--fleet", metavar="NAME", help="its name (default: the only one of this user)")
+    command.add_argument("--web", action="store_true", help="serve a page on 127.0.0.1, not a window")
+    command.add_argument(
+        "--port", type=int, default=WEB_PORT, metavar="N", help="of that page; its data take N+1 (default: %(default)s)"
+    )
+    command.add_argument("--save", type=Path, metavar="FILE", help="keep it in a file (.rrd) instead, or beside --web")
+    command.add_argument("--film", type=Path, metavar="FILE", help="only draw how the map grew (.webp, .gif)")
 
 
 def _add_eval(commands: "_Commands[argparse.ArgumentParser]") -> None:
@@ -219,6 +242,8 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     fleet.add_argument(
         "--live-size", default="320x240", metavar="WxH", help="frames of realtime, at 60 Hz (default: %(default)s)"
     )
+    viewer = kinds.add_parser("viewer", help="what a viewer costs a fleet: with one, with one killed, with one hung")
+    viewer.add_argument("--rounds", type=int, default=3, metavar="N", help="runs of each kind (default: %(default)s)")
     chaos = kinds.add_parser("chaos", help="a fleet whose processes are killed and stopped: is the result the same?")
     chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
     chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
@@ -242,13 +267,28 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     overlap = kinds.add_parser("overlap", help="choosing overlapping sections on a long road")
     overlap.add_argument("--views", type=int, default=100_000, metavar="N", help="along it (default: %(default)s)")
     overlap.add_argument("--size", default="310x94", metavar="WxH", help="images (default: %(default)s)")
-    for kind in (track, mapping, curves, system, basin, variants, fleet):
+    for kind in (track, mapping, curves, system, basin, variants, fleet, viewer):
         kind.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     _add_layers(city)
-    for kind in (track, mapping, curves, system, basin, variants, codec, fleet, chaos, resume):
+    for kind in (track, mapping, curves, system, basin, variants, codec, fleet, chaos, resume, viewer):
         _add_layers(kind)
         _add_source_shorthands(kind)
-    for kind in (splat, overlap, city, track, mapping, curves, system, basin, variants, codec, fleet, chaos, resume):
+    for kind in (
+        splat,
+        overlap,
+        city,
+        track,
+        mapping,
+        curves,
+        system,
+        basin,
+        variants,
+        codec,
+        fleet,
+        chaos,
+        resume,
+        viewer,
+    ):
         kind.add_argument("--json", metavar="FILE", help=_JSON_HELP)
         kind.add_argument("--compare", metavar="FILE", help="an earlier result (--json) to set beside this one")
 
@@ -301,6 +341,16 @@ def _add_poses(command: argparse.ArgumentParser) -> None:
 def _add_recording(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--record", metavar="FILE", help="record frames, poses and events in this MCAP file (recorder.file)"
+    )
+
+
+def _add_viewing(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--view",
+        dest="assignments",
+        action="append_const",
+        const=VIEW_ASSIGNMENT,
+        help=f"show it in a browser while it lasts, at port {WEB_PORT} of 127.0.0.1 (viewer.web_port)",
     )
 
 

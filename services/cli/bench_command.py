@@ -20,6 +20,7 @@ from vtslam.services.bench.recording import bench_map, bench_system, bench_track
 from vtslam.services.bench.resume import bench_resume, is_whole
 from vtslam.services.bench.splat import bench_splat
 from vtslam.services.bench.variants import bench_variants
+from vtslam.services.bench.viewer import bench_viewer
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.run_command import assignments_of
 from vtslam.services.run_plan import RunPlan, plan_run
@@ -62,6 +63,7 @@ def _measured(args: Namespace) -> dict[str, object]:
         "overlap": _overlap,
         "variants": _variants,
         "resume": _resume,
+        "viewer": _viewer,
     }
     return kinds.get(args.bench, _recording)(args)
 
@@ -158,6 +160,14 @@ def _fleet(args: Namespace) -> dict[str, object]:
         rounds=args.rounds, live_seconds=args.live_seconds, live_sizes=(_size(args.latency_size), _size(args.live_size))
     )
     return bench_fleet(_plan(args), parts, bench, on_part=lambda text: print(f"bench fleet: {text}", file=sys.stderr))
+
+
+def _viewer(args: Namespace) -> dict[str, object]:
+    if args.rounds < 1:
+        raise ConfigError(f"bench viewer: expected --rounds of at least 1, found {args.rounds}")
+    return bench_viewer(
+        _plan(args), rounds=args.rounds, on_part=lambda text: print(f"bench viewer: {text}", file=sys.stderr)
+    )
 
 
 def _city(args: Namespace) -> dict[str, object]:

@@ -10,6 +10,7 @@ from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.trajectory_io import TrajectoryError
 from vtslam.services.sensor.sources.base import SourceError
 from vtslam.services.supervisor.errors import FleetError
+from vtslam.services.viewer.errors import ViewerError
 from vtslam.storage.errors import StorageError
 
 _FAILED, _USAGE = 1, 2
@@ -29,6 +30,7 @@ def execute(args: Namespace) -> int:
         FleetError,
         BusError,
         PrivateFolderError,
+        ViewerError,
     ) as error:
         return _refused(error, _FAILED)
     except BrokenPipeError:
@@ -61,6 +63,10 @@ def _command(args: Namespace) -> int:
             from vtslam.services.cli.status_command import status_command
 
             return status_command(args)
+        case "view":
+            from vtslam.services.cli.view_command import view_command
+
+            return view_command(args)
         case "eval":
             from vtslam.services.cli.eval_command import eval_command
 

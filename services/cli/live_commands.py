@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 from vtslam.common.bus import Bus
 from vtslam.common.config import ConfigError
+from vtslam.services.cli.arguments import VIEW_ASSIGNMENT, WEB_PORT
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.run_command import recording_of, summary_text
@@ -18,6 +19,7 @@ from vtslam.services.sensor.sources.base import LiveCamera, live_camera
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.fleet_run import FleetHooks
 from vtslam.services.supervisor.live_run import run_live
+from vtslam.services.viewer.rerun_process import page_url
 
 
 def up_command(args: Namespace) -> int:
@@ -26,6 +28,8 @@ def up_command(args: Namespace) -> int:
     console.print(
         f"fleet {args.fleet}: send frames with  vtslam publish SOURCE --fleet {args.fleet}   (Ctrl-C ends it)"
     )
+    if VIEW_ASSIGNMENT in args.assignments:
+        console.print(f"viewer: {page_url(WEB_PORT)}")
     with StopRequest() as stop, Progress(None, what="mapping", unit="frame") as progress:
         summary = run_live(
             args.out,

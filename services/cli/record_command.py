@@ -4,7 +4,7 @@ import os
 from argparse import Namespace
 from pathlib import Path
 
-from vtslam.common.bus import Bus, BusError, Member
+from vtslam.common.bus import Bus, BusError, Member, Steps
 from vtslam.common.bus_zenoh import join
 from vtslam.common.fleet_folder import FleetFolder, read_owner
 from vtslam.common.settings import RecorderSettings
@@ -29,14 +29,15 @@ def record_command(args: Namespace) -> int:
         link = ServiceLink(bus, 1)
         service = RecorderService(bus, link, folder, recording)
         with StopRequest() as stop:
-            _record(service, bus, link, folder, stop)
+            follow(service, bus, link, folder, stop)
         missed = link.counters.get("frames.missed", 0)
         console.print(f"{recording.num_frames} frames recorded, {missed} missed: {args.out}")
     console.result({"file": str(args.out.resolve()), "frames": recording.num_frames, "missed": missed})
     return 0
 
 
-def _record(service: RecorderService, bus: Bus, link: ServiceLink, folder: FleetFolder, stop: StopRequest) -> None:
+def follow(service: Steps, bus: Bus, link: ServiceLink, folder: FleetFolder, stop: StopRequest) -> None:
+    """Run a service beside a fleet until that ends, or somebody asks to stop."""
     try:
         while (patience_s := service.step()) is not None:
             link.stopping = link.stopping or stop() or _is_gone(folder)

@@ -7,12 +7,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from vtslam.common.config import ConfigError
+from vtslam.common.settings import Settings
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.pacing import Pacing
 from vtslam.services.run_plan import RunPlan, plan_resume, plan_run
 from vtslam.services.run_record import RunSummary
+from vtslam.services.viewer.rerun_process import page_url
 from vtslam.storage.errors import WriteFailed
 
 
@@ -24,6 +26,9 @@ def run_command(args: Namespace) -> int:
     pacing = plan.settings.fleet.pacing
     if args.in_process and pacing not in ("", Pacing.LOCKSTEP):
         raise ConfigError(f"--in-process works in lockstep, expected no other pacing, found {pacing}")
+    say_page(console, plan.settings)
+    if args.in_process and plan.settings.viewer.is_wanted:
+        raise ConfigError("--in-process has no viewer: leave out --view, or look at the run afterwards (vtslam view)")
     console.print(f"{plan.source.uri}: {len(plan.source)} frames, preset {plan.preset}, family {plan.family}")
     with StopRequest() as stop:
         try:
@@ -33,6 +38,12 @@ def run_command(args: Namespace) -> int:
     console.print(f"{summary_text(summary)}\nrun folder: {out}   (next: vtslam eval {out})")
     console.result({"run": str(out.resolve()), "source": plan.source.uri, **asdict(summary)})
     return stop.exit_status if summary.interrupted else 0
+
+
+def say_page(console: Console, settings: Settings) -> None:
+    """Say where the viewer's page is, if there is to be one."""
+    if settings.viewer.web_port:
+        console.print(f"viewer: {page_url(settings.viewer.web_port)}")
 
 
 def _checked_out(args: Namespace) -> Path:

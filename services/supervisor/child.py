@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from vtslam.services.map_follower import StoreArchive
     from vtslam.services.pacing import Pace
     from vtslam.services.service_link import ServiceLink
+    from vtslam.services.viewer.core import Poses
     from vtslam.storage.run_folder import RunFolder
 
 REFUSED = 3  # exit status: the input or the machine cannot be used; trying again would not help
@@ -84,9 +85,11 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
     from vtslam.common.settings import Settings
     from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
     from vtslam.services.free_memory import keep_large_arrays_apart
+    from vtslam.services.process_facts import yield_to_others
     from vtslam.services.sensor.sources.base import SourceError
     from vtslam.services.service_link import ServiceLink
     from vtslam.services.supervisor.processes import process_named
+    from vtslam.services.viewer.errors import ViewerError
     from vtslam.storage.errors import StorageError
     from vtslam.storage.run_folder import RunFolder
 
@@ -97,7 +100,10 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
     run = RunFolder.open(Path(owner.run_folder))
     info = run.read_info()
     settings = load(Settings, [(str(run.path), info.settings)])
-    member = Member(fleet=args.fleet, role=process_named(name).role, name=name)
+    process = process_named(name)
+    if process.is_expendable and settings.viewer.idle:
+        yield_to_others()  # before there are threads, which take it on
+    member = Member(fleet=args.fleet, role=process.role, name=name)
     with join(member, folder.path) as bus:
         link = ServiceLink(bus, args.epoch)
         link.stop_on_sigterm()
@@ -105,7 +111,7 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
             parts = _Parts(bus, link, folder, run, settings, info.facts.source, args.run_lock)
             run_steps(_BUILDERS[name](parts), bus)
             folder.write_counts(name, link.counters)
-        except (SourceError, StorageError, MapStoreFull, SharedMemoryFull) as error:
+        except (SourceError, StorageError, MapStoreFull, SharedMemoryFull, ViewerError) as error:
             folder.write_failure(name, str(error))
             return REFUSED
     return 0
@@ -208,12 +214,39 @@ def _recorder(parts: _Parts) -> "Steps":
     return RecorderService(parts.bus, parts.link, parts.folder, recording)
 
 
+def _viewer(parts: _Parts) -> "Steps":
+    from vtslam.services.supervisor.store import map_store
+    from vtslam.services.viewer.fleet_view import FleetView
+    from vtslam.services.viewer.rerun_sink import Outlets, RerunSink
+    from vtslam.services.viewer.service import ViewerService
+    from vtslam.storage.section_convert import SectionArchive
+
+    settings = parts.settings.viewer
+    view = FleetView(
+        map_store(parts.folder, parts.settings),
+        SectionArchive(parts.run),
+        settings=settings,
+        splat=parts.settings.splat,
+        truth=_truth(parts),
+    )
+    sink = RerunSink(Outlets.of(settings), title=parts.run.path.name, is_live=True)
+    return ViewerService(parts.bus, parts.link, view, sink, cpu_share=settings.cpu_share)
+
+
+def _truth(parts: _Parts) -> "Poses | None":
+    """True poses of the recording, if it is one and has them."""
+    from vtslam.services.sensor.sources.registry import open_source
+
+    return None if parts.is_live else open_source(parts.source).ground_truth()
+
+
 _BUILDERS: dict[str, Callable[[_Parts], "Steps"]] = {
     "sensor": _sensor,
     "tracker": _tracker,
     "mapper": _mapper,
     "archiver": _archiver,
     "recorder": _recorder,
+    "viewer": _viewer,
 }
 
 if __name__ == "__main__":

@@ -117,14 +117,17 @@ class ChildProcess:
             self._ended_counts = self._folder.counts(self.process.name)
             return None
         if code == REFUSED:
+            why = self._folder.failure(self.process.name)
+            if self.process.is_expendable:
+                return self._died(why, now_s, frames)
             self.finished = True
-            raise ProcessRefused(self.process.name, self._folder.failure(self.process.name))
+            raise ProcessRefused(self.process.name, why)
         how = f"killed by signal {-code}" if code < 0 else f"ended with status {code}"
         return self._died(how, now_s, frames)
 
     def kill_if_hung(self, now_s: float, frames: int) -> str | None:
-        """Kill it if it is silent for too long; what to tell the user then."""
-        if self._popen is None:
+        """Kill it if it is silent for too long and others need it; what to tell the user then."""
+        if self._popen is None or self.process.is_expendable:
             return None
         if now_s - self._present_s > _MISSING_S:
             why = "left the bus while it ran"
@@ -145,6 +148,9 @@ class ChildProcess:
 
     def _died(self, how: str, now_s: float, frames: int) -> str:
         self.deaths += 1
+        if self.process.is_expendable:
+            self.finished = True
+            return f"{self.process.name}: {how}; the fleet goes on without it"
         self._deaths_here = self._deaths_here + 1 if frames == self._frames_then else 1
         self._frames_then = frames
         text = f"{self.process.name}: {how} after {frames} frames"

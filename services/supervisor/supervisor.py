@@ -21,11 +21,12 @@ from vtslam.services.pacing import Pacing
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import ProcessRefused
-from vtslam.services.supervisor.processes import ARCHIVER, MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, Process
+from vtslam.services.supervisor.processes import ARCHIVER, MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, VIEWER, Process
 from vtslam.services.supervisor.progress import FleetProgress
 from vtslam.storage.errors import WriteFailed
 
 _POLL_S = 0.1  # between looks at the processes, when the bus is silent
+_PARTING_S = 5.0  # that an expendable process has for its last step
 
 Environment = Callable[[str, int], Mapping[str, str]]  # of a process by name, at its n-th start
 
@@ -37,6 +38,7 @@ class _Phase(Enum):
     FINISHING = "finishing the rest"  # the sensor has ended
     LAST_ENDING = "ending"  # and so has the second of the other two
     STORING = "storing the rest"  # all have but the archiver, and the recorder if there is one
+    SHOWING = "showing the rest"  # and the viewer, if there is one
     ENDED = "ended"
 
 
@@ -97,6 +99,7 @@ class Supervisor:
         self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
         self._told: set[str] = set()  # processes that were said to wait
         self._phase = _Phase.RUNNING
+        self._parting_ends_s: float | None = None
         self.refusal: ProcessRefused | None = None
 
     @property
@@ -196,7 +199,8 @@ class Supervisor:
 
         Where every frame is mapped, the mapper knows by itself when that is, and needs the tracker until then.
         In realtime the tracker says what was dropped to the last frame, and the mapper takes what there is.
-        The archiver ends when all is written, a recorder when there is nothing new to record.
+        The archiver ends when all is written, a recorder when there is nothing new to record; a viewer is told, and
+        given a moment.
         """
         sensor, mapper, tracker = (self._children[process.name] for process in (SENSOR, MAPPER, TRACKER))
         second, last = (tracker, mapper) if self._pacing is Pacing.REALTIME else (mapper, tracker)
@@ -221,8 +225,22 @@ class Supervisor:
             recorder = self._children.get(RECORDER.name)
             if recorder is not None:
                 self._end(recorder)
-            if all(child.finished for child in self._children.values()):
+            if all(child.finished for child in self._children.values() if not child.process.is_expendable):
+                self._phase = _Phase.SHOWING
+        if self._phase is _Phase.SHOWING:
+            viewer = self._children.get(VIEWER.name)
+            if viewer is None or viewer.finished or self._has_parted(viewer):
                 self._phase = _Phase.ENDED
+
+    def _has_parted(self, child: ChildProcess) -> bool:
+        """Let an expendable process end by itself for a moment, then at once."""
+        self._end(child)
+        if self._parting_ends_s is None:
+            self._parting_ends_s = self._now_s() + _PARTING_S
+        if self._now_s() >= self._parting_ends_s:
+            child.kill()
+            child.finished = True
+        return child.finished
 
     def _end(self, child: ChildProcess) -> None:
         """Let a process end; one that does not run stays so."""

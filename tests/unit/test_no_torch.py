@@ -27,6 +27,7 @@ def test_every_public_name_is_there_and_the_cpu_path_never_imports_torch(tmp_pat
         "import vtslam.services.supervisor.live_run, vtslam.services.supervisor.child\n"
         "import vtslam.services.sensor.service, vtslam.services.tracker.service, vtslam.services.mapper.service\n"
         "import vtslam.services.archiver.service\n"
+        "import vtslam.services.viewer.service, vtslam.services.viewer.rerun_sink, vtslam.services.run_view\n"
         "assert all(getattr(vtslam, name) is not None for name in vtslam.__all__)\n"
         "assert set(vtslam.__all__) <= set(dir(vtslam))\n"
         "vtslam.run(sys.argv[1], sys.argv[2], assignments=['section.length=2'])\n"

@@ -26,6 +26,11 @@ def test_who_may_come_from_elsewhere_publishes_no_poses_and_gives_no_orders() ->
     assert allowed == {"sensor/pixels"}
 
 
+def test_a_viewer_says_how_it_is_and_nothing_else() -> None:
+    assert {topic.suffix for topic in TOPICS if Role.VIEWER in topic.publishers} == {"status/{service}"}
+    assert not any(Role.VIEWER in query.answerers for query in QUERIES)
+
+
 def test_keys_lie_below_their_fleet() -> None:
     assert SENSOR_FRAME.key("kitchen") == f"{ROOT}/kitchen/sensor/frame"
     assert STATUS.key("kitchen", "mapper") == f"{ROOT}/kitchen/status/mapper"
