@@ -173,12 +173,13 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
 def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query: QueryTopic[Any, Any]) -> None:
     print(f"seed {SEED}")
     rng = np.random.default_rng(SEED)
-    mapper, writer = backend.join(Role.MAPPER), _raw_session(backend.join(Role.OBSERVER, "hostile"))
-    queryable = mapper.queryable(query)
+    answerer = backend.join(min(query.answerers))
+    writer = _raw_session(backend.join(Role.OBSERVER, "hostile"))
+    queryable = answerer.queryable(query)
     querier = writer.declare_querier(
         query.key("test"), timeout=PATIENCE_S, congestion_control=zenoh.CongestionControl.BLOCK
     )
-    assert mapper.until(lambda: querier.matching_status or None, timeout_s=PATIENCE_S)
+    assert answerer.until(lambda: querier.matching_status or None, timeout_s=PATIENCE_S)
     refusals = 0
     expected: Counter[tuple[str, str]] = Counter()
     for number in range(1000):
@@ -189,16 +190,16 @@ def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query:
             # A reply may be lost on a busy machine; the asker then gets none, which it must bear with anyway.
             refusals += sum(reply.err is not None for reply in querier.get(payload=data))
             key, count = (query.suffix, verdict), expected[query.suffix, verdict]
-            counted = mapper.until(lambda: mapper.rejections().get(key) == count or None, timeout_s=PATIENCE_S)  # noqa: B023
+            counted = answerer.until(lambda: answerer.rejections().get(key) == count or None, timeout_s=PATIENCE_S)  # noqa: B023
             assert counted, f"question {number}, {verdict}, was not counted"
         else:
             replies = querier.get(payload=data)
-            question = mapper.until(queryable.receive, timeout_s=PATIENCE_S)
+            question = answerer.until(queryable.receive, timeout_s=PATIENCE_S)
             assert question is not None
             question.refuse("a test")
             assert len(list(replies)) <= 1
     refused = {key: count for key, count in expected.items() if key[1]}
-    assert mapper.rejections() == refused
+    assert answerer.rejections() == refused
     assert 0.95 * sum(refused.values()) <= refusals <= sum(refused.values())
     querier.undeclare()
 

@@ -79,7 +79,7 @@ def test_a_drive_through_town_tells_what_grows(tmp_path: Path) -> None:
     assert 0 < values["shm_peak_mb"] <= 2.0
     assert min(values[key] for key in ("map_mb", "map_disk_mb", "recording_mb", "disk_mb_per_s")) > 0
     # On a busy machine all frames may lie between two looks at the fleet, so that growth is not known.
-    assert set(values["rss_growth_by_process"]) == {"sensor", "tracker", "mapper", "supervisor"}
+    assert set(values["rss_growth_by_process"]) == {"sensor", "tracker", "mapper", "archiver", "supervisor"}
     assert set(values["time_growth_by_process"]) == set(values["rss_growth_by_process"])
     assert all(values[key] is None or values[key] >= 0 for key in ("rss_growth", "time_growth"))
     assert values["sections_reloaded"] >= 0

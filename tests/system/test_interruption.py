@@ -12,6 +12,7 @@ from vtslam.common.fleet_folder import sweep_dead_fleets
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
 from vtslam.services.process_facts import children_of, is_gone
+from vtslam.services.supervisor.processes import PROCESSES
 from vtslam.storage.run_folder import RunFolder
 
 
@@ -51,7 +52,7 @@ def test_without_their_supervisor_the_processes_of_a_fleet_end_and_are_swept(tmp
         process.kill()
         process.communicate()
 
-    assert len(children) == 3
+    assert len(children) == len(PROCESSES)
     for _ in range(int(DEADLINE_S / POLL_S)):
         if all(is_gone(pid) for pid in children):
             break
