@@ -256,7 +256,7 @@ FLEET_EVENT = Topic(
     history=256,
     rate_hz=None,
     recorded=False,
-    publishers=SERVICES,
+    publishers=SERVICES - {Role.VIEWER},  # it may end at any time, which concerns nobody
     readers_elsewhere=_ELSEWHERE,
 )
 CONTROL = Topic(
