@@ -76,8 +76,8 @@ def test_each_finds_a_known_pose(name: str) -> None:
     task = seen_by_map(not name.startswith("adam")) if name in ON_RENDERED_FRAME else seen_by_sensor()
     found = variant.solver.solve(task, STEP @ se3.inverse(pose(3)))
     metres, degrees = pose_error(se3.inverse(found.T_camera_section), pose(3))
-    assert metres < 0.008  # of 0.02: the map is of three small frames
-    assert degrees < 0.25
+    assert metres < 0.008  # of 0.02 m and 1 degree; the map is of three small frames
+    assert degrees < 0.4
     assert found.full_size_renders <= found.renders
 
 
