@@ -21,14 +21,12 @@ namespace {
 constexpr int kBands = 16;
 constexpr int kPackedChannels = 10, kSampled = 9;
 constexpr int kLanes = 16, kBatch = 64;
-constexpr int kBatchesInFloat = 32;  // sums of so many batches stay in float
-constexpr float kNearest = 0.01f;    // metres
+constexpr int kBatchesInFloat = 32;       // sums of so many batches stay in float
+constexpr float kNearest = 0.01f;         // metres
 constexpr int64_t kWorthThreads = 20000;  // measurements; fewer take less time than a thread takes to start
 
 // Huber: weight and cost of a residual in sigmas.
-VTSLAM_INLINE float huber_weight(float r) {
-  return 1.0f / std::max(std::fabs(r), 1.0f);
-}
+VTSLAM_INLINE float huber_weight(float r) { return 1.0f / std::max(std::fabs(r), 1.0f); }
 VTSLAM_INLINE float huber_cost(float r) {
   const float a = std::fabs(r), squared = std::min(a, 1.0f);
   return squared * (a - 0.5f * squared);

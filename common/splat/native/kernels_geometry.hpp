@@ -214,7 +214,8 @@ template <bool geometry>
 VTSLAM_INLINE void chain_group(const View& view, ChainGroup& g) {
   for (int l = 0; l < kGroup; ++l) {
     const float* s = g.sums[l];
-    const double mxx = sum_of<geometry>(s, kSumXX), mxy = sum_of<geometry>(s, kSumXY), myy = sum_of<geometry>(s, kSumYY);
+    const double mxx = sum_of<geometry>(s, kSumXX), mxy = sum_of<geometry>(s, kSumXY),
+                 myy = sum_of<geometry>(s, kSumYY);
     const double ka = double(g.conic_xx[l]) * (-2.0 * kLn2), kb = double(g.conic_xy[l]) * double(-kLn2);
     const double kc = double(g.conic_yy[l]) * (-2.0 * kLn2);
     const double p00 = ka * mxx + kb * mxy, p01 = ka * mxy + kb * myy;
