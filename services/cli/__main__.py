@@ -1,9 +1,13 @@
 """The command line ``vtslam``: picks the command, and turns refusals into one line and an exit status."""
 
+import os
 import sys
 from collections.abc import Sequence
 
 from vtslam.services.cli import arguments
+
+# Before NumPy is loaded: its products are of small matrices, and threads that wait for them spin beside the kernels.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 OK, FAILED, USAGE = 0, 1, 2
 _INTERRUPTED = 130  # 128 + SIGINT, as shells count
