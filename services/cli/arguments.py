@@ -245,7 +245,7 @@ def _add_bench(commands: "_Commands[argparse.ArgumentParser]") -> None:
     viewer = kinds.add_parser("viewer", help="what a viewer costs a fleet: with one, with one killed, with one hung")
     viewer.add_argument("--rounds", type=int, default=3, metavar="N", help="runs of each kind (default: %(default)s)")
     chaos = kinds.add_parser("chaos", help="a fleet whose processes are killed and stopped: is the result the same?")
-    chaos.add_argument("--kills", type=int, default=24, metavar="N", help="kills (default: %(default)s)")
+    chaos.add_argument("--kills", type=int, default=36, metavar="N", help="kills (default: %(default)s)")
     chaos.add_argument("--hangs", type=int, default=5, metavar="N", help="stops of 15 s (default: %(default)s)")
     chaos.add_argument("--seed", type=int, default=1, metavar="S", help="draws them (default: %(default)s)")
     chaos.add_argument(
