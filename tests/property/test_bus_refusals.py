@@ -11,7 +11,7 @@ import zenoh
 from helpers.bus_backends import ZenohBackend, zenoh_backend
 from helpers.bus_messages import MAX_BYTES, RANDOM
 
-from vtslam.common.bus import Bus
+from vtslam.common.bus import Bus, Queryable
 from vtslam.common.bus_inbox import Subscriber
 from vtslam.common.messages import Message, MessageError, SectionRequest, decode, encode
 from vtslam.common.topics import EVERY_SERVICE, QUERIES, SECTION_LOAD, TOPICS, QueryTopic, Role, Topic
@@ -169,6 +169,17 @@ def test_every_refused_message_is_counted_on_every_topic(backend: ZenohBackend) 
         publisher.undeclare()
 
 
+def _wait_for_a_question(answerer: Bus, queryable: Queryable[Any, Any], querier: zenoh.Querier, request: bytes) -> None:
+    """Ask until it arrives: on a busy machine the way may be known to the asker before the hub goes it."""
+    for _ in range(int(PATIENCE_S)):
+        answers = querier.get(payload=request)
+        while (question := answerer.until(queryable.receive, timeout_s=1.0)) is not None:
+            question.refuse("a test")  # this one, or one before it that came late
+            if any(reply.err is not None for reply in answers):
+                return
+    raise AssertionError("no question arrived")
+
+
 @pytest.mark.parametrize("query", QUERIES, ids=lambda query: query.suffix)
 def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query: QueryTopic[Any, Any]) -> None:
     print(f"seed {SEED}")
@@ -180,6 +191,7 @@ def test_refused_questions_and_answers_are_counted(backend: ZenohBackend, query:
         query.key("test"), timeout=PATIENCE_S, congestion_control=zenoh.CongestionControl.BLOCK
     )
     assert answerer.until(lambda: querier.matching_status or None, timeout_s=PATIENCE_S)
+    _wait_for_a_question(answerer, queryable, querier, _good(np.random.default_rng(SEED), query.request, 0))
     refusals = 0
     expected: Counter[tuple[str, str]] = Counter()
     for number in range(1000):
@@ -212,7 +224,6 @@ def test_a_refused_answer_is_no_answer_and_counted(backend: ZenohBackend) -> Non
             query.reply(SECTION_LOAD.key("test"), b"\xc1")
 
     handler: zenoh.handlers.Callback[zenoh.Query] = zenoh.handlers.Callback(answer, indirect=False)
-    declared = writer.declare_queryable(SECTION_LOAD.key("test"), handler)
     request = SectionRequest(section_id=1, reader="tracker")
 
     def ended() -> str | None:
@@ -220,6 +231,10 @@ def test_a_refused_answer_is_no_answer_and_counted(backend: ZenohBackend) -> Non
         tracker.wait(0.2)
         return "refused" if tracker.rejections() else None
 
-    assert tracker.until(ended, timeout_s=PATIENCE_S) == "refused"
+    for _ in range(12):  # on a busy machine the hub may not go the way to one that was just declared
+        declared = writer.declare_queryable(SECTION_LOAD.key("test"), handler)
+        if tracker.until(ended, timeout_s=PATIENCE_S / 12):
+            break
+        declared.undeclare()
     assert set(tracker.rejections()) == {("section/load", "not_msgpack")}
     declared.undeclare()
