@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from helpers.fleet_watching import Conductor, Observer, Slow, Watched
 from helpers.small_map import room_frame, room_pose, section_bytes
 
 from vtslam.common import failpoints
@@ -21,13 +22,12 @@ from vtslam.common.external_pose import ExternalPose
 from vtslam.common.fleet_folder import shared_memory_folder
 from vtslam.common.frame import Frame
 from vtslam.common.geometry.camera import Camera
-from vtslam.common.messages import Command, Control, ServiceState
 from vtslam.common.preset_loading import load_settings
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.shm.map_store import MapStore
 from vtslam.common.splat.native_engine import NativeEngine
-from vtslam.common.topics import CONTROL, EVERY_SERVICE, STATUS, Role
+from vtslam.common.topics import Role
 from vtslam.services.archiver.service import ArchiverService
 from vtslam.services.frame_journal import JournalReader
 from vtslam.services.map_follower import MapFollower, StoreArchive
@@ -48,13 +48,12 @@ FRAMES, SIZE = 5, (20, 15)
 TIMEOUT_S = 600.0  # simulated
 
 
-def settings_of(section_length: int, *assignments: str, length_m: float = 0.0) -> Settings:
+def settings_of(section_length: int, *assignments: str) -> Settings:
     """Of a small map."""
     return load_settings(
         preset="fast",
         assignments=[
             f"section.length={section_length}",
-            f"section.length_m={length_m}",
             "section.candidate_interval=1",
             "mapper.iterations_head=2",
             "mapper.iterations_regular=1",
@@ -144,81 +143,6 @@ def expected(settings: Settings = SETTINGS, frames: int = FRAMES) -> Result:
     )
 
 
-@dataclass(slots=True)
-class Watched:
-    """A service whose end is noted, as a supervisor notes that of a process."""
-
-    name: str
-    steps: Steps
-    ended: set[str]
-
-    def step(self) -> float | None:
-        patience_s = self.steps.step()
-        if patience_s is None:
-            self.ended.add(self.name)
-        return patience_s
-
-
-@dataclass(slots=True)
-class Slow:
-    """A service whose working steps take a while, in which it neither hears nor does anything."""
-
-    steps: Steps
-    seconds: float
-    bus: Bus
-    busy_until_ns: int = 0
-
-    def step(self) -> float | None:
-        left_ns = self.busy_until_ns - self.bus.clock.monotonic_ns()
-        if left_ns > 0:
-            return 1e-9 * left_ns
-        patience_s = self.steps.step()
-        if patience_s == 0.0 and self.seconds > 0.0:
-            self.busy_until_ns = self.bus.clock.monotonic_ns() + int(1e9 * self.seconds)
-            return self.seconds
-        return patience_s
-
-
-class _Conductor:
-    """Ends the fleet in order, as its supervisor does."""
-
-    def __init__(self, bus: Bus, epochs: dict[str, int], ended: set[str], last_frame_id: int) -> None:
-        self._epochs, self._ended, self._last = epochs, ended, last_frame_id
-        self._ordered: set[tuple[str, int]] = set()
-        self._orders = {name: bus.publisher(CONTROL, service=name) for name in epochs}
-
-    def step(self) -> float | None:
-        if self._ended == self._epochs.keys():
-            return None
-        if "sensor" in self._ended:
-            self._order("mapper", Command.DRAIN)
-        if "mapper" in self._ended:
-            self._order("tracker", Command.STOP)
-            if "archiver" in self._epochs:
-                self._order("archiver", Command.DRAIN)
-        return 0.1
-
-    def _order(self, name: str, command: Command) -> None:
-        epoch = self._epochs[name]
-        if (name, epoch) not in self._ordered:
-            self._ordered.add((name, epoch))
-            self._orders[name].publish(Control(command=command, through_frame_id=self._last, epoch=epoch))
-
-
-class _Observer:
-    """Keeps what services say that do not work as they should."""
-
-    def __init__(self, bus: Bus, degraded: dict[str, str], ended: set[str], services: int) -> None:
-        self._statuses = bus.subscriber(STATUS, service=EVERY_SERVICE)
-        self._degraded, self._ended, self._num_services = degraded, ended, services
-
-    def step(self) -> float | None:
-        while (received := self._statuses.receive()) is not None:
-            if received.message.state is ServiceState.DEGRADED:
-                self._degraded[received.message.service] = received.message.detail
-        return None if len(self._ended) == self._num_services else 0.5
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stream:
     """What goes through a fleet: frames of a closed path of ``path`` ones, how they are mapped, and at which pace.
@@ -275,7 +199,7 @@ class FleetWorld:
             self._add(role, start)
         self.world.add_service(
             Member(fleet="test", role=Role.SUPERVISOR),
-            lambda bus: _Conductor(bus, self._epochs, self._ended, len(self._source) - 1),
+            lambda bus: Conductor(bus, self._epochs, self._ended, len(self._source) - 1),
         )
         if stream.archiver is not None:
             self.world.add_service(Member(fleet="test", role=Role.OBSERVER), self._observer)
@@ -322,7 +246,7 @@ class FleetWorld:
         return StoreArchive(self._store, SectionArchive(RunFolder.open(self._run.path)), load=loader.load)
 
     def _observer(self, bus: Bus) -> Steps:
-        return _Observer(bus, self.degraded, self._ended, len(self._epochs))
+        return Observer(bus, self.degraded, self._ended, len(self._epochs))
 
     def _archiver(self, bus: Bus) -> Steps:
         assert self._archiving is not None

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from helpers.fleet_world import ENGINE, FewFrames, Sections, Slow, Watched
+from helpers.fleet_watching import Slow, Watched
+from helpers.fleet_world import ENGINE, FewFrames, Sections
 
 from vtslam.common.bus import Bus, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld

@@ -13,7 +13,7 @@ from vtslam.services.system import System
 
 _FRAMES, _LENGTH, _LENGTH_M = 11, 4, 0.04
 _PATH, _SIZE = 96, (32, 24)  # motion that tracking can follow
-_SETTINGS = settings_of(_LENGTH, length_m=_LENGTH_M)
+_SETTINGS = settings_of(_LENGTH, f"section.length_m={_LENGTH_M}")
 _SEEDS = 5
 
 

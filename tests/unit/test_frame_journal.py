@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.facts import frame_facts
 
 from vtslam.common.messages import SectionArchived, TrackerHistory
 from vtslam.common.shm.errors import SharedMemoryFull
 from vtslam.common.shm.map_store import MapStore
 from vtslam.services.commit_facts import CommitFacts
-from vtslam.services.frame_facts import CommittedFrame, FrameFacts
+from vtslam.services.frame_facts import CommittedFrame
 from vtslam.services.frame_journal import JournalReader, JournalWriter
 from vtslam.services.supervisor.progress import FleetProgress
 from vtslam.storage.catalog import Catalog
@@ -21,31 +22,7 @@ LENGTH = 3
 
 
 def facts_of(frame_id: int) -> CommitFacts:
-    about = FrameFacts(
-        frame_id=frame_id,
-        section_id=frame_id // LENGTH,
-        is_head=frame_id % LENGTH == 0,
-        held_out=False,
-        state="ok",
-        tracked_section_id=0,
-        rescued=False,
-        covered_share=0.5,
-        color_loss=0.1,
-        depth_loss_m=0.02,
-        position_sigma_m=0.001,
-        rotation_sigma_rad=0.002,
-        exposure_gain=(1.0, 1.0, 1.0),
-        exposure_offset=(0.0, 0.0, 0.0),
-        map_loss=0.3,
-        gaussians_added=4,
-        gaussians=40,
-        track_renders=5,
-        map_renders=6,
-        read_s=0.0,
-        track_s=0.0,
-        map_s=0.0,
-        total_s=0.0,
-    )
+    about = frame_facts(frame_id, section_id=frame_id // LENGTH, is_head=frame_id % LENGTH == 0)
     T = np.eye(4)
     T[0, 3] = 0.1 * frame_id
     return CommitFacts(

@@ -6,15 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 from helpers.broken_recordings import FAULTS, broken, late_depth, shifted_color
 from helpers.shared_data import shared_data
 
 from vtslam.common.frame import Frame
-from vtslam.common.geometry.camera import Camera
 from vtslam.services.cli.__main__ import main
-from vtslam.services.sensor.sources.base import Source
+from vtslam.services.sensor.sources.base import Source, SourceAround
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.sensor_check.edges import EdgeEvidence
 from vtslam.services.sensor_check.examination import BURST, examine, planned_looks
@@ -32,50 +30,31 @@ NAMES = (
 )
 
 
-@dataclass(slots=True, eq=False)
-class Kept:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Kept(SourceAround):
     """A source that reads each frame once."""
 
-    inner: Source
     frames: dict[int, Frame] = field(default_factory=dict)
 
-    @property
-    def uri(self) -> str:
-        return self.inner.uri
-
-    @property
-    def family(self) -> str:
-        return self.inner.family
-
-    @property
-    def camera(self) -> Camera:
-        return self.inner.camera
-
-    @property
-    def depth_scale_m(self) -> float:
-        return self.inner.depth_scale_m
-
-    def __len__(self) -> int:
-        return len(self.inner)
+    @classmethod
+    def of(cls, source: Source) -> "Kept":
+        return cls(inner=source, uri=source.uri)
 
     def frame(self, index: int) -> Frame:
         if index not in self.frames:
             self.frames[index] = self.inner.frame(index)
         return self.frames[index]
 
-    def ground_truth(self) -> npt.NDArray[np.float64] | None:
-        return self.inner.ground_truth()
-
 
 @pytest.fixture(scope="module")
 def room() -> Source:
-    return Kept(open_source("sim:room?frames=72&size=200x150"))
+    return Kept.of(open_source("sim:room?frames=72&size=200x150"))
 
 
 @pytest.fixture(scope="module")
 def kitchen() -> Source:
     """As much of it as shows every fault."""
-    return Kept(open_source(f"replica:{shared_data('redkitchen')}", size=(320, 240), frames=(0, 90)))
+    return Kept.of(open_source(f"replica:{shared_data('redkitchen')}", size=(320, 240), frames=(0, 90)))
 
 
 def findings(source: Source) -> dict[str, CheckFinding]:
