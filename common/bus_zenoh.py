@@ -25,6 +25,7 @@ from vtslam.common.bus_zenoh_again import KeptMessages, ask_for
 from vtslam.common.bus_zenoh_query import ZenohPending, ZenohQueryable
 from vtslam.common.messages import Message, Reason, encode
 from vtslam.common.private_folder import HUB_SOCKET, check_private_folder, make_private_folder
+from vtslam.common.scheduling import threads_that_answer_at_once
 from vtslam.common.topics import Overflow, QueryTopic, Topic, again_key, alive_key
 
 M = TypeVar("M", bound=Message)
@@ -103,7 +104,8 @@ def join_by(member: Member, config: Config, *, timeout_s: float = 10.0, clock: C
 
 def _opened(config: Config) -> zenoh.Session:
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        with threads_that_answer_at_once():  # zenoh's own, which all that is sent goes through
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError as error:
         places: list[str] = (config.get("connect") or config["listen"])["endpoints"]
         raise BusError(f"{config['mode']} at {', '.join(places)}: {error}") from error

@@ -1,28 +1,87 @@
-"""Where the stream is cut into sections: after so many frames, or so many metres."""
+"""Where the stream is cut into sections: after so many frames, or so many metres, or when memory is full."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.geometry.camera import Camera
 from vtslam.common.section import Section
-from vtslam.common.settings import SectionSettings
+from vtslam.common.settings import Settings
+from vtslam.common.shm.capacity import MappingCost
 
 
-def section_is_full(T_section_frames: Sequence[npt.NDArray[np.float64]], settings: SectionSettings) -> bool:
-    """Whether a section takes no further frame.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SectionEnd:
+    """When a section takes no further frame.
 
-    Whoever has the committed poses comes to the same answer, to the bit: poses are relative to the section, so that
-    neither its place in the world nor a later correction of that matters.
+    Whoever has the committed poses and the map that frames are tracked against comes to the same answer, to the bit:
+    poses are relative to the section, so that neither its place in the world nor a later correction of that matters.
 
-    Args:
-        T_section_frames: float64 [4,4], of its frames up to now.
-        settings: How long sections are.
+    Attributes:
+        frames: After so many frames ...
+        metres: ... or so many metres between their cameras, 0 for any ...
+        gaussians: ... or when the map that the next frame would be tracked against has so many Gaussians.
+        lead: Frames that tracking is ahead of mapping.
     """
-    if len(T_section_frames) >= settings.length:
-        return True
-    return settings.length_m > 0.0 and travelled_m(T_section_frames) >= settings.length_m
+
+    frames: int
+    metres: float
+    gaussians: int
+    lead: int = 0
+
+    @classmethod
+    def of(cls, settings: Settings, camera: Camera, *, lead: int = 0) -> "SectionEnd":
+        """As the settings say, so that the map store holds what one more frame adds if it shows nothing known.
+
+        One process keeps no map store, but ends sections where a fleet would.
+        """
+        fitting = _mapping_cost(settings, camera, lead).gaussians_within(settings.fleet.map_budget_mb * 10**6)
+        unseen = (1 + lead) * camera.width * camera.height
+        section = settings.section
+        return cls(frames=section.length, metres=section.length_m, gaussians=max(fitting - unseen, 1), lead=lead)
+
+    def is_reached_by_poses(self, T_section_frames: Sequence[npt.NDArray[np.float64]]) -> bool:
+        """Whether these poses, float64 [4,4] of a section's frames up to now, end it."""
+        if len(T_section_frames) >= self.frames:
+            return True
+        return self.metres > 0.0 and travelled_m(T_section_frames) >= self.metres
+
+    def is_reached_by_gaussians(self, count: int) -> bool:
+        """Whether so many Gaussians in the map that the next frame would be tracked against end the section."""
+        return count >= self.gaussians
+
+    def is_reached(self, section: Section) -> bool:
+        """Whether a section with these frames takes no further one."""
+        if self.is_reached_by_poses(poses_in(section)):
+            return True
+        # Gaussians are in the order of their frames, and none goes before the section is finished.
+        known = np.searchsorted(section.gaussians.frame_index, tracked_against(len(section.frames), self.lead))
+        return self.is_reached_by_gaussians(int(known))
+
+
+def least_budget_mb(settings: Settings, camera: Camera, *, lead: int = 0) -> int:
+    """The smallest ``fleet.map_budget_mb`` with which a section has room for a head and a frame beside it."""
+    gaussians = (2 + lead) * camera.width * camera.height + 1
+    return -(-_mapping_cost(settings, camera, lead).bytes_with(gaussians) // 10**6)
+
+
+def _mapping_cost(settings: Settings, camera: Camera, lead: int) -> MappingCost:
+    section = settings.section
+    return MappingCost.of(
+        camera,
+        frames=section.length,
+        views=-(-section.length // section.candidate_interval),
+        with_moments=settings.mapper.keep_moments,
+        kept_generations=1 + lead,
+    )
+
+
+def tracked_against(row: int, lead: int) -> int:
+    """Frames of its section whose map the frame in this row is tracked against, ``lead`` frames ahead of mapping."""
+    return min(row, max(row - lead, 1))
 
 
 def travelled_m(T_section_frames: Sequence[npt.NDArray[np.float64]]) -> float:

@@ -271,7 +271,7 @@ class MapperSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetSettings:
-    """The processes of a run; of it, only `pacing` and `lead` change results.
+    """The processes of a run; `pacing` and `lead` change results, and so does a tight `map_budget_mb`.
 
     Attributes:
         pacing: Who waits for whom: each frame is tracked once those before it are mapped (lockstep), or while the one
@@ -280,7 +280,8 @@ class FleetSettings:
         lead: Frames that tracking is ahead of mapping when pipelined.
         replay_hz: Frames per second of a recording in realtime; 0 as they were captured.
         tracker_threads, mapper_threads: Threads of these processes; 0 as splat.threads.
-        map_budget_mb: Shared memory for the map, 10^6 bytes; finished sections leave it for the run folder as needed.
+        map_budget_mb: Shared memory for the map, 10^6 bytes; finished sections leave it for the run folder as needed,
+            and a section ends early before it is too large to be mapped in it.
         hang_s: A process whose work loop is silent for so long is killed and started again; more than any step takes.
         metrics_port: Where 127.0.0.1 answers Prometheus; 0 for nowhere.
     """

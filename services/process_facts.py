@@ -59,14 +59,16 @@ def cpu_seconds(pid: int) -> float:
 
 
 def yield_to_others() -> None:
-    """Let this process and what it starts run only where nobody else wants to: nice 19, SCHED_IDLE, lowest autogroup.
+    """Let this process and what it starts run only where nobody else wants to: nice 19, SCHED_IDLE.
 
-    Threads that there are already keep theirs.
+    Where the kernel groups processes by session, that counts within its own; a process that leads a session lowers the
+    session too. Threads that there are already keep theirs.
     """
     os.nice(19)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    with contextlib.suppress(OSError):  # not every kernel has groups; where they are, nice counts within one only
-        Path("/proc/self/autogroup").write_text("19")
+    if os.getsid(0) == os.getpid():
+        with contextlib.suppress(OSError):  # not every kernel has groups
+            Path("/proc/self/autogroup").write_text("19")
 
 
 def _status_mb(path: Path, key: str) -> float:

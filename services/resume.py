@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 from vtslam.common.frame import Frame
-from vtslam.common.section_end import section_is_full
-from vtslam.common.settings import SectionSettings
+from vtslam.common.section_end import SectionEnd
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.sensor.sources.base import Source
 from vtslam.storage.catalog_rows import STORED, SectionRow
@@ -28,7 +27,7 @@ class ResumePoint:
     frame: Frame
 
 
-def prepare_to_resume(run: RunFolder, source: Source, *, section: SectionSettings) -> ResumePoint | None:
+def prepare_to_resume(run: RunFolder, source: Source, *, end: SectionEnd) -> ResumePoint | None:
     """Bring a run folder to the end of its last durable full section.
 
     A shorter last section, which a run leaves that was asked to stop, is dropped unless the recording ends with it:
@@ -37,7 +36,7 @@ def prepare_to_resume(run: RunFolder, source: Source, *, section: SectionSetting
     Args:
         run: The run folder, open for writing.
         source: Its recording.
-        section: How long sections are.
+        end: Where sections end.
 
     Returns:
         Where to go on; None for the beginning.
@@ -47,14 +46,14 @@ def prepare_to_resume(run: RunFolder, source: Source, *, section: SectionSetting
         SourceError: The last frame cannot be read.
     """
     last: SectionRow | None = None
+    before: SectionRow | None = None
     for row in run.catalog.sections():
-        is_short = row.num_frames < section.length and row.end_frame_id < len(source)
-        if row.state != STORED or (is_short and section.length_m == 0.0):
+        if row.state != STORED:
             break
         require_intact(run, row)
-        if is_short and not section_is_full(tuple(run.read_section(row.section_id).T_section_frame), section):
-            break
-        last = row
+        last, before = row, last
+    if last is not None and not _is_whole(run, last, source, end):
+        last = before  # those before it are: the run went on after them
     run.drop_sections(0 if last is None else last.section_id + 1)
     run.remove_derived()
     if last is None:
@@ -69,3 +68,16 @@ def prepare_to_resume(run: RunFolder, source: Source, *, section: SectionSetting
             f"{run.path}: frame {frame.frame_id} of {source.uri} is not the one that was mapped; the recording changed"
         )
     return ResumePoint(section_id=last.section_id, facts=facts, frame=frame)
+
+
+def _is_whole(run: RunFolder, row: SectionRow, source: Source, end: SectionEnd) -> bool:
+    """Whether the last section would have taken no further frame.
+
+    Gaussians that went when it was finished are not counted any more. So it may be mapped again in vain, with the same
+    result.
+    """
+    if row.num_frames == end.frames or row.end_frame_id == len(source):
+        return True
+    return end.is_reached_by_poses(tuple(run.read_section(row.section_id).T_section_frame)) or (
+        end.is_reached_by_gaussians(row.num_gaussians)
+    )

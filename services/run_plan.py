@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from vtslam.common.config import ConfigError, load, to_dict
 from vtslam.common.preset_loading import load_settings
+from vtslam.common.section_end import SectionEnd, least_budget_mb
 from vtslam.common.settings import Settings, SourceSettings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.engines import engine_versions, make_engine
@@ -124,7 +125,7 @@ class RunPlan:
         from vtslam.services.supervisor.fleet_run import run_in_fleet
 
         with RunFolder.open(folder, writable=True) as run:
-            point = self._prepared(run)
+            point = self._prepared(run, lead=pace_of(self.settings.fleet, live=False).lead)
             if self._is_complete(point):
                 return _closed(run)
             return run_in_fleet(run, self.settings, hooks, resume=point)
@@ -132,8 +133,8 @@ class RunPlan:
     def _is_complete(self, point: ResumePoint | None) -> bool:
         return point is not None and point.facts.num_frames == len(self.source)
 
-    def _prepared(self, run: RunFolder) -> ResumePoint | None:
-        point = prepare_to_resume(run, self.source, section=self.settings.section)
+    def _prepared(self, run: RunFolder, *, lead: int = 0) -> ResumePoint | None:
+        point = prepare_to_resume(run, self.source, end=SectionEnd.of(self.settings, self.source.camera, lead=lead))
         done = 0 if point is None else point.facts.num_frames
         run.catalog.add_event("resumed", f"after {done} frames, by vtslam {program_version()}")
         return point
@@ -199,6 +200,10 @@ def plan_run(
     settings = load_settings(preset=preset, family=family, file=config, assignments=assignments)
     if not settings.tracker.enabled and source.frame(0).pose_prior is None:
         raise ConfigError(f"--tracking off: {source.uri}: expected a pose for the first frame (--poses), found none")
+    budget_mb, least_mb = settings.fleet.map_budget_mb, least_budget_mb(settings, source.camera)
+    if budget_mb < least_mb:
+        size = f"{source.camera.width}x{source.camera.height}"
+        raise ConfigError(f"fleet.map_budget_mb = {budget_mb}: expected at least {least_mb} for frames of {size}")
     return RunPlan(source=source, settings=settings, engine=make_engine(settings.splat), preset=preset, family=family)
 
 

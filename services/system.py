@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from vtslam.common.frame import Frame
 from vtslam.common.section import Section
-from vtslam.common.section_end import poses_in, section_is_full
+from vtslam.common.section_end import SectionEnd
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Engine
 from vtslam.services.mapper.state import ActiveSection, CommitRecord
@@ -132,7 +132,7 @@ class System:
             frame, commit.T_world_camera, tracking, mean_depth_m(frame), exposure=commit.exposure
         )
         self._frames += 1
-        is_full = section_is_full(poses_in(self.active.section), self.settings.section)
+        is_full = SectionEnd.of(self.settings, frame.camera).is_reached(self.active.section)
         sealed = self._seal() if is_full else None
         return FrameReport(
             frame=frame,

@@ -86,16 +86,15 @@ def _view_live(args: Namespace, console: Console) -> int:
     owner = read_owner(folder.path)
     if owner is None:
         raise SharedMemoryError(f"{folder.path}: expected a running fleet, found one that is gone")
-    yield_to_others()  # before there are threads, which take it on
-    from vtslam.services.viewer.fleet_view import FleetView
-    from vtslam.services.viewer.rerun_sink import RerunSink
-    from vtslam.services.viewer.service import ViewerService
-
     with RunFolder.open(Path(owner.run_folder)) as run:
         info = run.read_info()
         settings: Settings = load(Settings, [(str(run.path), info.settings)])
         if settings.viewer.idle:
             yield_to_others()  # before there are threads, which take it on
+        from vtslam.services.viewer.fleet_view import FleetView
+        from vtslam.services.viewer.rerun_sink import RerunSink
+        from vtslam.services.viewer.service import ViewerService
+
         store, archive, truth = map_store(folder, settings), SectionArchive(run), _truth(info.facts.source)
         view = FleetView(store, archive, settings=settings.viewer, splat=settings.splat, truth=truth)
         sink = RerunSink(_outlets(args), title=owner.fleet, is_live=True)

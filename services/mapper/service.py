@@ -8,7 +8,7 @@ from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.messages import FrameCommitted, SectionSealed, ServiceState, TrackedPose
 from vtslam.common.section import Section
-from vtslam.common.section_end import poses_in, section_is_full
+from vtslam.common.section_end import SectionEnd
 from vtslam.common.settings import Settings
 from vtslam.common.shm.active_writer import ActiveWriter
 from vtslam.common.shm.errors import FrameGone, MapStoreFull, SharedMemoryFull
@@ -150,7 +150,8 @@ class MapperService:
         return self._intake.is_drained(self._num_frames, self._link.drain_through)
 
     def _section_ends(self, active: ActiveSection) -> bool:
-        return section_is_full(poses_in(active.section), self._settings.section) or self._is_drained()
+        end = SectionEnd.of(self._settings, active.section.camera, lead=self._pace.lead)
+        return end.is_reached(active.section) or self._is_drained()
 
     # --- taking over ------------------------------------------------------------------------------------------------
 

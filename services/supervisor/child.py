@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 REFUSED = 3  # exit status: the input or the machine cannot be used; trying again would not help
 _PR_SET_PDEATHSIG = 1
+_SWITCH_S = 0.0005  # after which Python code makes way for a message that has come; usually 5 ms
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +95,7 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
     from vtslam.storage.run_folder import RunFolder
 
     keep_large_arrays_apart()
+    sys.setswitchinterval(_SWITCH_S)
     name: str = args.name
     owner = read_owner(folder.path)
     assert owner is not None
@@ -156,7 +158,7 @@ def _tracker(parts: _Parts) -> "Steps":
     bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
     if pace.is_realtime:
         return RealtimeTracker(bus, link, core, follower, ring_path)
-    return TrackerService(bus, link, core, follower, ring_path, section=settings.section, lead=pace.lead)
+    return TrackerService(bus, link, core, follower, ring_path, settings=settings, lead=pace.lead)
 
 
 def _mapper(parts: _Parts) -> "Steps":

@@ -87,7 +87,9 @@ class ChildProcess:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             pass_fds=self._handed_down,
-            start_new_session=True,  # Ctrl-C in a terminal is for the supervisor
+            # Ctrl-C in a terminal is for the supervisor. Not a session each: the kernel may share processors out among
+            # sessions first (autogroups), and threads that answer at once would do so only within their own.
+            process_group=0,
         )
 
     def heard(self, status: ServiceStatus, now_s: float) -> None:

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from vtslam.common.bus import Bus
 from vtslam.common.frame import Frame
 from vtslam.common.messages import ServiceState
-from vtslam.common.section_end import section_is_full
-from vtslam.common.settings import SectionSettings
+from vtslam.common.section_end import SectionEnd, tracked_against
+from vtslam.common.settings import Settings
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.shm.frame_ring import FrameRingReader
 from vtslam.common.shm.ring_layout import FrameDescriptor
@@ -40,7 +40,7 @@ class TrackerService:
         tracker: The core.
         follower: The map; the store keeps ``lead`` generations besides the last.
         ring_path: Where the frame ring is, or will be.
-        section: How long sections are.
+        settings: The effective settings; they say where sections end.
         lead: Frames that tracking may be ahead of mapping.
     """
 
@@ -52,11 +52,11 @@ class TrackerService:
         follower: MapFollower,
         ring_path: Path,
         *,
-        section: SectionSettings,
+        settings: Settings,
         lead: int = 0,
     ) -> None:
         self._clock, self._link, self._tracker, self._follower = bus.clock, link, tracker, follower
-        self._ring_path, self._section, self._lead = ring_path, section, lead
+        self._ring_path, self._settings, self._lead = ring_path, settings, lead
         self._ring: FrameRingReader | None = None
         self._descriptors = Descriptors(bus, link)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
@@ -90,7 +90,7 @@ class TrackerService:
         frame_id = max(self._follower.num_frames, self._proposed + 1)
         poses = self._poses_before(frame_id)
         section_id, row = self._follower.section_id, len(poses)
-        if section_is_full(poses, self._section) or not self._map_is_there(frame_id, section_id, row):
+        if not self._map_is_there(frame_id, section_id, row) or self._is_full(poses):
             return False  # a full section is sealed before its successor's head is tracked
         descriptor = self._descriptor_of(frame_id)
         if descriptor is None or self._ring is None:
@@ -127,7 +127,15 @@ class TrackerService:
 
     def _generation(self, row: int) -> int:
         """Frames of its section that a frame is tracked against."""
-        return min(row, max(row - self._lead, 1))
+        return tracked_against(row, self._lead)
+
+    def _is_full(self, poses: tuple[npt.NDArray[np.float64], ...]) -> bool:
+        """Whether the section that goes on takes no frame after these; the map is there."""
+        section = self._follower.map.active
+        if not poses or section is None:
+            return False
+        end = SectionEnd.of(self._settings, section.camera, lead=self._lead)
+        return end.is_reached_by_poses(poses) or end.is_reached_by_gaussians(section.gaussians.count)
 
     def _map_is_there(self, frame_id: int, section_id: int, row: int) -> bool:
         """Bring the map to where the frame in ``row`` is tracked against it; false if it is not that far."""

@@ -133,14 +133,17 @@ class Sections(ReadsSections):
 @lru_cache(maxsize=2)
 def expected(settings: Settings = SETTINGS, frames: int = FRAMES) -> Result:
     """The result of one process."""
-    sections, source = Sections(), FewFrames(frames)
+    return in_one_process(FewFrames(frames), settings)[0]
+
+
+def in_one_process(source: "FewFrames", settings: Settings) -> tuple[Result, Sections]:
+    """The result of one process, and its sections."""
+    sections = Sections()
     system = System(settings, ENGINE, sections, threads=1)
-    reports = [system.process(source.frame(index)) for index in range(frames)]
+    reports = [system.process(source.frame(index)) for index in range(len(source))]
     system.finish()
-    return Result(
-        tuple(section_bytes(section) for section in sections.written.values()),
-        tuple(report.commit.T_world_camera.tobytes() for report in reports),
-    )
+    written = tuple(section_bytes(section) for section in sections.written.values())
+    return Result(written, tuple(report.commit.T_world_camera.tobytes() for report in reports)), sections
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -284,7 +287,7 @@ class FleetWorld:
             core,
             follower,
             self._folder / "ring",
-            section=self._settings.section,
+            settings=self._settings,
             lead=self._pace.lead,
         )
 

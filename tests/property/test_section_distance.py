@@ -3,13 +3,11 @@
 from functools import lru_cache
 
 import pytest
-from helpers.fleet_world import ENGINE, FewFrames, Result, Sections, Stream, run_world, settings_of
-from helpers.small_map import section_bytes
+from helpers.fleet_world import FewFrames, Result, Sections, Stream, in_one_process, run_world, settings_of
 
 from vtslam.common.bus_schedule import ScriptedSchedule, SeededKills, SeededSchedule
-from vtslam.common.section_end import poses_in, section_is_full
+from vtslam.common.section_end import SectionEnd, poses_in
 from vtslam.services.pacing import Pace, Pacing
-from vtslam.services.system import System
 
 _FRAMES, _LENGTH, _LENGTH_M = 11, 4, 0.04
 _PATH, _SIZE = 96, (32, 24)  # motion that tracking can follow
@@ -23,29 +21,24 @@ def stream(lead: int) -> Stream:
 
 
 @lru_cache(maxsize=1)
-def in_one_process() -> tuple[Result, Sections]:
-    sections, source = Sections(), FewFrames(_FRAMES, _PATH, _SIZE)
-    system = System(_SETTINGS, ENGINE, sections, threads=1)
-    reports = [system.process(source.frame(index)) for index in range(_FRAMES)]
-    system.finish()
-    written = tuple(section_bytes(section) for section in sections.written.values())
-    return Result(written, tuple(report.commit.T_world_camera.tobytes() for report in reports)), sections
+def alone() -> tuple[Result, Sections]:
+    return in_one_process(FewFrames(_FRAMES, _PATH, _SIZE), _SETTINGS)
 
 
 @lru_cache(maxsize=3)
 def undisturbed(lead: int) -> Result:
-    return in_one_process()[0] if lead == 0 else run_world(ScriptedSchedule(), stream=stream(lead))[0]
+    return alone()[0] if lead == 0 else run_world(ScriptedSchedule(), stream=stream(lead))[0]
 
 
 def test_sections_end_by_frames_or_by_metres() -> None:
-    _, sections = in_one_process()
+    _, sections = alone()
     lengths = [len(section.frames) for section in sections.written.values()]
     assert sum(lengths) == _FRAMES
     assert max(lengths) == _LENGTH > min(lengths[:-1])
     for section in list(sections.written.values())[:-1]:
-        poses = poses_in(section)
-        assert section_is_full(poses, _SETTINGS.section)
-        assert not section_is_full(poses[:-1], _SETTINGS.section)
+        poses, end = poses_in(section), SectionEnd.of(_SETTINGS, section.camera)
+        assert end.is_reached_by_poses(poses)
+        assert not end.is_reached_by_poses(poses[:-1])
 
 
 @pytest.mark.parametrize("lead", [0, 1, 2])

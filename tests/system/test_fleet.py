@@ -2,6 +2,7 @@
 
 import signal
 import socket
+from dataclasses import replace
 from pathlib import Path
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -12,6 +13,7 @@ from helpers.processes import leftovers
 from helpers.recordings import cut_in_half
 from helpers.shared_data import shared_data
 
+from vtslam.common.config import ConfigError
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_resume, plan_run
@@ -20,7 +22,6 @@ from vtslam.services.supervisor.errors import FleetError
 from vtslam.storage.run_folder import RunFolder
 
 KILL = signal.SIGKILL
-LARGE_MAP = ("section.length=2", "fleet.map_budget_mb=16", "mapper.iterations_seal=1")
 
 
 def test_a_fleet_gives_the_same_bytes_as_one_process(small: SmallRecording, tmp_path: Path) -> None:
@@ -113,8 +114,12 @@ def test_sections_leave_memory_within_the_budget_and_are_read_again(small: Small
 
 
 def test_a_map_that_cannot_fit_ends_the_fleet_in_order(small: SmallRecording, tmp_path: Path) -> None:
-    plan = small_plan(small.files, "source.size=640x480", *LARGE_MAP)
-    calm = Disturbance()
+    words = ("source.size=640x480", "section.length=2", "mapper.iterations_seal=1")
+    with pytest.raises(ConfigError, match=r"fleet.map_budget_mb = 16: expected at least \d+ for frames of 640x480"):
+        small_plan(small.files, *words, "fleet.map_budget_mb=16")
+    roomy, calm = small_plan(small.files, *words), Disturbance()
+    fleet = replace(roomy.settings.fleet, map_budget_mb=16)  # as a camera may have it that is known only when it comes
+    plan = replace(roomy, settings=replace(roomy.settings, fleet=fleet))
     with pytest.raises(FleetError, match=r"\d+ bytes wanted, \d+ of the map store's 16000000 bytes are in use"):
         plan.execute_in_fleet(tmp_path / "many", calm.hooks())
 

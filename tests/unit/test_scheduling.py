@@ -1,0 +1,83 @@
+"""Threads that hand messages on do not wait for others' time slices."""
+
+import os
+import re
+import threading
+from pathlib import Path
+
+import pytest
+
+from vtslam.common.bus import Member
+from vtslam.common.bus_zenoh import Hub, join
+from vtslam.common.scheduling import threads_that_answer_at_once
+from vtslam.common.topics import Role
+
+SHORTEST_NS = 100_000
+
+
+def slices_ns() -> dict[str, int]:
+    """Of the threads of this process by id, as the kernel tells them."""
+    found = {}
+    for path in Path("/proc/self/task").glob("[0-9]*/sched"):
+        if (line := re.search(r"^se\.slice\s*:\s*(\d+)$", path.read_text(), re.MULTILINE)) is not None:
+            found[path.parent.name] = int(line[1])
+    return found
+
+
+def own_slice_ns() -> int:
+    return slices_ns()[str(threading.get_native_id())]
+
+
+def slice_of_new_thread_ns() -> int:
+    found: list[int] = []
+    thread = threading.Thread(target=lambda: found.append(own_slice_ns()))
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+@pytest.fixture(autouse=True)
+def _kernel_has_slices() -> None:
+    release = re.match(r"(\d+)\.(\d+)", os.uname().release)
+    assert release is not None
+    if (int(release[1]), int(release[2])) < (6, 12):
+        pytest.skip("threads have slices of their own from Linux 6.12 on")
+    try:
+        found = slices_ns()
+    except OSError as error:
+        pytest.skip(f"the kernel does not tell: {error}")
+    if not found:
+        pytest.skip("the kernel does not tell")
+
+
+def test_threads_started_within_have_the_shortest_slice_and_others_what_is_usual() -> None:
+    usual = own_slice_ns()
+    assert usual > SHORTEST_NS
+    with threads_that_answer_at_once():
+        assert slice_of_new_thread_ns() == SHORTEST_NS
+    assert own_slice_ns() == usual
+    assert slice_of_new_thread_ns() == usual
+
+
+def test_what_runs_only_where_nobody_else_wants_to_stays_so() -> None:
+    found: list[int] = []
+
+    def idle() -> None:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        with threads_that_answer_at_once():
+            found.append(os.sched_getscheduler(0))
+
+    thread = threading.Thread(target=idle)
+    thread.start()
+    thread.join()
+    assert found == [os.SCHED_IDLE]
+
+
+def test_all_threads_of_a_session_on_the_bus_answer_at_once(tmp_path: Path) -> None:
+    before = slices_ns()
+    folder = tmp_path / "hub"
+    with Hub(folder, "test"), join(Member(fleet="test", role=Role.TRACKER), folder) as bus:
+        assert bus.wait(0.0) in (True, False)
+        started = {thread: each for thread, each in slices_ns().items() if thread not in before}
+        assert len(started) >= 2
+        assert set(started.values()) == {SHORTEST_NS}
