@@ -23,7 +23,7 @@ class SectionEnd:
     Attributes:
         frames: After so many frames ...
         metres: ... or so many metres between their cameras, 0 for any ...
-        gaussians: ... or when the map that the next frame would be tracked against has so many Gaussians.
+        gaussians: ... or when another frame may make it have more Gaussians than these.
         lead: Frames that tracking is ahead of mapping.
     """
 
@@ -34,14 +34,13 @@ class SectionEnd:
 
     @classmethod
     def of(cls, settings: Settings, camera: Camera, *, lead: int = 0) -> "SectionEnd":
-        """As the settings say, so that the map store holds what one more frame adds if it shows nothing known.
+        """As the settings say, and as the map store holds.
 
         One process keeps no map store, but ends sections where a fleet would.
         """
         fitting = _mapping_cost(settings, camera, lead).gaussians_within(settings.fleet.map_budget_mb * 10**6)
-        unseen = (1 + lead) * camera.width * camera.height
         section = settings.section
-        return cls(frames=section.length, metres=section.length_m, gaussians=max(fitting - unseen, 1), lead=lead)
+        return cls(frames=section.length, metres=section.length_m, gaussians=fitting, lead=lead)
 
     def is_reached_by_poses(self, T_section_frames: Sequence[npt.NDArray[np.float64]]) -> bool:
         """Whether these poses, float64 [4,4] of a section's frames up to now, end it."""
@@ -49,17 +48,26 @@ class SectionEnd:
             return True
         return self.metres > 0.0 and travelled_m(T_section_frames) >= self.metres
 
-    def is_reached_by_gaussians(self, count: int) -> bool:
-        """Whether so many Gaussians in the map that the next frame would be tracked against end the section."""
-        return count >= self.gaussians
+    def is_reached_by_gaussians(self, frame_index: npt.NDArray[np.uint16], row: int) -> bool:
+        """Whether the Gaussians end the section before the frame in ``row``.
+
+        Those count that are in the map which this frame would be tracked against. It, and those that are tracked before
+        it is mapped, may each add as many as the head did, if they show nothing known.
+
+        Args:
+            frame_index: uint16 [N], the frames that Gaussians of the section are tied to, in order: those of that map,
+                or of a later one. None goes before the section is finished.
+            row: At least 1.
+        """
+        known, head = np.searchsorted(frame_index, (tracked_against(row, self.lead), 1)).tolist()
+        return bool(known + (1 + self.lead) * head > self.gaussians)
 
     def is_reached(self, section: Section) -> bool:
         """Whether a section with these frames takes no further one."""
-        if self.is_reached_by_poses(poses_in(section)):
-            return True
-        # Gaussians are in the order of their frames, and none goes before the section is finished.
-        known = np.searchsorted(section.gaussians.frame_index, tracked_against(len(section.frames), self.lead))
-        return self.is_reached_by_gaussians(int(known))
+        poses = poses_in(section)
+        return self.is_reached_by_poses(poses) or self.is_reached_by_gaussians(
+            section.gaussians.frame_index, len(poses)
+        )
 
 
 def least_budget_mb(settings: Settings, camera: Camera, *, lead: int = 0) -> int:

@@ -78,6 +78,6 @@ def _is_whole(run: RunFolder, row: SectionRow, source: Source, end: SectionEnd) 
     """
     if row.num_frames == end.frames or row.end_frame_id == len(source):
         return True
-    return end.is_reached_by_poses(tuple(run.read_section(row.section_id).T_section_frame)) or (
-        end.is_reached_by_gaussians(row.num_gaussians)
-    )
+    section = run.read_section(row.section_id)
+    poses = tuple(section.T_section_frame)
+    return end.is_reached_by_poses(poses) or end.is_reached_by_gaussians(section.frame_index, len(poses))

@@ -135,7 +135,7 @@ class TrackerService:
         if not poses or section is None:
             return False
         end = SectionEnd.of(self._settings, section.camera, lead=self._lead)
-        return end.is_reached_by_poses(poses) or end.is_reached_by_gaussians(section.gaussians.count)
+        return end.is_reached_by_poses(poses) or end.is_reached_by_gaussians(section.gaussians.frame_index, len(poses))
 
     def _map_is_there(self, frame_id: int, section_id: int, row: int) -> bool:
         """Bring the map to where the frame in ``row`` is tracked against it; false if it is not that far."""

@@ -19,8 +19,8 @@ from vtslam.common.settings import Settings
 from vtslam.services.pacing import Pace, Pacing
 
 _FRAMES, _LENGTH, _PATH = 14, 12, 24
-_BUDGETS_MB = {0: 2, 1: 3, 2: 3}  # by lead: some frames' worth of such frames
-_SIZES = {0: (40, 30), 1: (56, 42), 2: (48, 36)}
+_BUDGETS_MB = {0: 3, 1: 4, 2: 5}  # by lead: of some such frames
+_SIZE = (40, 30)
 _SEEDS = 3
 
 
@@ -32,7 +32,7 @@ def stream(lead: int) -> Stream:
     return Stream(
         frames=_FRAMES,
         path=_PATH,
-        size=_SIZES[lead],
+        size=_SIZE,
         settings=settings_for(lead),
         pace=Pace(pacing=Pacing.PIPELINED if lead else Pacing.LOCKSTEP, lead=lead),
         archiver=Archiving(budget_bytes=_BUDGETS_MB[lead] * 10**6),
@@ -42,7 +42,7 @@ def stream(lead: int) -> Stream:
 @lru_cache(maxsize=3)
 def undisturbed(lead: int) -> Result:
     if lead == 0:
-        return in_one_process(FewFrames(_FRAMES, _PATH, _SIZES[0]), settings_for(0))[0]
+        return in_one_process(FewFrames(_FRAMES, _PATH, _SIZE), settings_for(0))[0]
     return run_world(ScriptedSchedule(), stream=stream(lead))[0]
 
 

@@ -60,19 +60,19 @@ def test_gaussians_end_a_section_by_the_map_that_its_next_frame_would_be_tracked
     section = room_section(0, 4)
     through = [int((section.gaussians.frame_index < frames).sum()) for frames in range(5)]
     assert through == sorted(set(through))  # each frame adds some
-    known = through[tracked_against(4, lead)]
-    for limit, reached in ((known, True), (known + 1, False)):
-        assert SectionEnd(frames=30, metres=0.0, gaussians=limit, lead=lead).is_reached(section) is reached
+    likely = through[tracked_against(4, lead)] + (1 + lead) * through[1]
+    for most, reached in ((likely, False), (likely - 1, True)):
+        assert SectionEnd(frames=30, metres=0.0, gaussians=most, lead=lead).is_reached(section) is reached
 
 
-def test_a_budget_leaves_room_for_a_frame_that_shows_nothing_known() -> None:
+def test_what_a_budget_holds() -> None:
     small, large = (SectionEnd.of(settings_of(f"fleet.map_budget_mb={budget}"), CAMERA) for budget in (48, 96))
     assert 150_000 < small.gaussians < 300_000
     assert large.gaussians > 2 * small.gaussians
     pixels = CAMERA.width * CAMERA.height
     without = SectionEnd.of(settings_of("fleet.map_budget_mb=48", "mapper.keep_moments=false"), CAMERA)
     assert without.gaussians > small.gaussians + pixels
-    assert SectionEnd.of(settings_of("fleet.map_budget_mb=48"), CAMERA, lead=1).gaussians < small.gaussians - pixels
+    assert SectionEnd.of(settings_of("fleet.map_budget_mb=48"), CAMERA, lead=1).gaussians < small.gaussians
 
 
 def test_the_least_budget_has_room_for_a_head_and_a_frame_and_a_smaller_one_has_not() -> None:
@@ -80,4 +80,4 @@ def test_the_least_budget_has_room_for_a_head_and_a_frame_and_a_smaller_one_has_
     pixels = CAMERA.width * CAMERA.height
     for budget_mb, enough in ((least_mb, True), (least_mb - 1, False)):
         end = SectionEnd.of(settings_of(f"fleet.map_budget_mb={budget_mb}"), CAMERA)
-        assert (end.gaussians > pixels) is enough
+        assert (end.gaussians > 2 * pixels) is enough
