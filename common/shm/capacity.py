@@ -9,14 +9,12 @@ from vtslam.common.shm.growing_file import CHUNK_ROWS, ColumnLayout, ColumnTypes
 from vtslam.common.shm.sealed_block import sealed_bytes_of
 from vtslam.common.shm.section_columns import LEARNED_COLUMNS, ROW, TIE_COLUMNS, ImageLayout
 
-_SPARE_BUFFERS = 2  # of learned columns besides the newest: one to write to, one that a reader has still pinned
+_WRITTEN, _PINNED = 1, 1  # buffers of learned columns besides those kept: the next one, and one that a reader still has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappingCost:
-    """Bytes of an active section beside the finished one before it, should that be as large.
-
-    To seal a section takes less than to map it: its spare buffers go first.
+    """The most bytes that an active section takes until it is sealed, beside a finished one before it that is as large.
 
     Attributes:
         fixed_bytes: Of images, tables and records.
@@ -37,15 +35,18 @@ class MappingCost:
             with_moments: Whether the optimiser's moments are kept, in two files that take turns.
             kept_generations: Of the active section.
         """
-        buffers = kept_generations + _SPARE_BUFFERS
-        growing = _row_bytes(TIE_COLUMNS) + buffers * _row_bytes(LEARNED_COLUMNS)
-        growing += 2 * _row_bytes(MOMENT_COLUMNS) if with_moments else 0
+        ties, learned, moments = (_row_bytes(each) for each in (TIE_COLUMNS, LEARNED_COLUMNS, MOMENT_COLUMNS))
+        moments = moments if with_moments else 0
+        buffers = kept_generations + _WRITTEN + _PINNED
+        growing = ties + buffers * learned + 2 * moments
+        # Sealing writes all once more, but needs no buffer to write to, and the moments once.
+        sealing = ties + (buffers - _WRITTEN) * learned + moments + (ties + learned)
         image_bytes = ImageLayout(camera).frame_bytes
         fixed = CONTROL_BYTES + aligned(frames * ROW.itemsize) + frames * image_bytes + buffers * RECORD_BYTES
         fixed += CHUNK_ROWS * growing  # columns grow by whole chunks
-        fixed += sealed_bytes_of(camera, frames=frames, views=views, gaussians=0)
+        fixed += 2 * sealed_bytes_of(camera, frames=frames, views=views, gaussians=0)
         fixed += 2 * (CONTROL_BYTES + RECORD_BYTES + image_bytes)  # last commits: of the section before, and a new one
-        return cls(fixed_bytes=fixed, bytes_each=growing + _row_bytes(TIE_COLUMNS + LEARNED_COLUMNS))
+        return cls(fixed_bytes=fixed, bytes_each=max(growing, sealing) + ties + learned)
 
     def gaussians_within(self, budget_bytes: int) -> int:
         """The most that fit; 0 if nothing does."""
