@@ -1,6 +1,7 @@
 """A run before it starts: source, settings and engine, all checked, so that nothing is refused half-way."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +18,11 @@ from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import program_version, versions
-from vtslam.services.recorder.files import make_way, maybe_recording
+from vtslam.services.recorder.files import check_way, make_way, maybe_recording
 from vtslam.services.recording_run import run_recording
 from vtslam.services.resume import ResumePoint, prepare_to_resume
 from vtslam.services.run_record import RunRecord, RunSummary
-from vtslam.services.sensor.sources.base import Source, SourceError, live_camera
+from vtslam.services.sensor.sources.base import Source, SourceError, SourceUri, live_camera
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.processes import LIVE_SOURCE
 from vtslam.storage.errors import RunFolderError
@@ -75,9 +76,8 @@ class RunPlan:
             StorageError: The folder cannot be made or written.
             SourceError: A frame cannot be read; what was done before it is kept.
         """
-        make_way(self.settings.recorder, overwrite=overwrite)
         with (
-            RunFolder.create(folder, self.info(created_by), overwrite=overwrite) as run,
+            self._made_folder(folder, self.info(created_by), overwrite=overwrite) as run,
             maybe_recording(self.settings.recorder, family=self.family) as recording,
         ):
             return run_recording(
@@ -147,9 +147,16 @@ class RunPlan:
         """
         from vtslam.services.supervisor.fleet_run import run_in_fleet
 
-        make_way(self.settings.recorder, overwrite=overwrite)
-        with RunFolder.create(folder, self.info(), overwrite=overwrite) as run:
+        with self._made_folder(folder, self.info(), overwrite=overwrite) as run:
             return run_in_fleet(run, self.settings, hooks)
+
+    @contextmanager
+    def _made_folder(self, folder: Path, info: RunInfo, *, overwrite: bool) -> Iterator[RunFolder]:
+        """A new run folder; an earlier recording goes only once that is made and so nothing is refused any more."""
+        check_way(self.settings.recorder, overwrite=overwrite, used=SourceUri.parse(self.source.uri).files())
+        with RunFolder.create(folder, info, overwrite=overwrite) as run:
+            make_way(self.settings.recorder, overwrite=overwrite)
+            yield run
 
     def info(self, created_by: str | None = None) -> RunInfo:
         """What ``run.toml`` says at the start; ``created_by`` is this program and its version if None."""

@@ -79,7 +79,9 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         help="one process for all services; the result is that of lockstep",
     )
     command.add_argument("--out", type=Path, metavar="RUN", help="run folder to make")
-    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    command.add_argument(
+        "--overwrite", action="store_true", help="give up an earlier run in RUN, and an earlier recording"
+    )
     command.add_argument(
         "--resume",
         type=Path,
@@ -104,7 +106,9 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
-    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    command.add_argument(
+        "--overwrite", action="store_true", help="give up an earlier run in RUN, and an earlier recording"
+    )
     _add_pacing(command, default="realtime")
     _add_recording(command)
     _add_viewing(command)
@@ -138,7 +142,9 @@ def _add_record(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="MCAP file to make")
-    command.add_argument("--overwrite", action="store_true", help="give up an earlier recording")
+    command.add_argument(
+        "--overwrite", action="store_true", help="give up an earlier recording, FILE-2 and so on included"
+    )
     command.add_argument("--color", choices=["png", "jpeg"], default="png", help="png keeps every bit (default)")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
