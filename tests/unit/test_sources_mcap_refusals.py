@@ -131,6 +131,7 @@ def test_odd_images_are_refused_when_read(change: Callable[[BagWriter], None], t
     [
         ({"tolerance_ms": "-1"}, "option tolerance_ms: expected a positive number, found '-1'"),
         ({"stamp": "wall"}, "option stamp: expected one of header, log, found 'wall'"),
+        ({"distortion": "maybe"}, "option distortion: expected one of refuse, ignore, found 'maybe'"),
         ({"camera": "/x"}, "option camera: expected a topic with intrinsics /camera/color/camera_info, found '/x'"),
         ({"gamma": "1"}, "expected options among .*; found 'gamma'"),
     ],

@@ -174,14 +174,7 @@ def _camera(uri: SourceUri, file: McapFile, color: Topic) -> Camera:
     message = file.message(topic, 0)
     where = _place(file, topic, message)
     found = decoding.calibration_of(topic, message.data, where)
-    matrix = found.matrix
-    if any(found.distortion) and _choice(uri, "distortion", ("refuse", "ignore")) == "refuse":
-        if "rect" not in color.name.rsplit("/", 1)[-1]:
-            raise SourceError(
-                f"{where}: expected images without lens distortion, found coefficients {list(found.distortion)}; "
-                "rectify them first, or see what comes of it with distortion=ignore"
-            )
-        matrix = found.rectified
+    matrix = _matrix(uri, found, where, is_rectified=mcap_topics.is_rectified(color))
     if not (1 <= found.width <= _MAX_SIDE and 1 <= found.height <= _MAX_SIDE):
         raise SourceError(f"{where}: expected images of 1 to {_MAX_SIDE} pixels, found {found.width}x{found.height}")
     intrinsics = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
@@ -189,6 +182,20 @@ def _camera(uri: SourceUri, file: McapFile, color: Topic) -> Camera:
         return files.integer_centred_camera(uri, width=found.width, height=found.height, intrinsics=intrinsics)
     except ValueError as error:
         raise SourceError(f"{where}: expected intrinsics, found {error}") from error
+
+
+def _matrix(uri: SourceUri, found: decoding.CalibrationMessage, where: str, *, is_rectified: bool) -> tuple[float, ...]:
+    """The 3x3 of the images by rows: K, or where they are rectified P."""
+    refuses = _choice(uri, "distortion", ("refuse", "ignore")) == "refuse"
+    if is_rectified and found.rectified[0] != 0.0:
+        return found.rectified
+    if any(found.distortion) and refuses:
+        wanted = "the matrix P of rectified images" if is_rectified else "images without lens distortion"
+        raise SourceError(
+            f"{where}: expected {wanted}, found coefficients {list(found.distortion)}; "
+            "rectify them first, or see what comes of it with distortion=ignore"
+        )
+    return found.matrix
 
 
 def _units_per_m(uri: SourceUri) -> float:
