@@ -16,6 +16,7 @@ from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Rendering
 from vtslam.services.engines import make_engine
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.storage.catalog_rows import STORED
 from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
@@ -48,8 +49,10 @@ class RecordedRun:
         self.source = open_source(self.info.facts.source)
         self._engine = make_engine(self.settings.splat)
         self._archive = SectionArchive(self.folder)
+        # Sections first: of a run that goes on, what comes after them may be longer, and never shorter.
+        self._section_ids = [row.section_id for row in self.folder.catalog.sections() if row.state == STORED]
         self.rows: list[dict[str, Any]] = self.folder.read_frames()
-        self.poses = self.folder.catalog.poses()[1]
+        self.poses = self.folder.catalog.poses()[1][: len(self.rows)]
         self._check()
         self._frames_of = _ranges([row["section_id"] for row in self.rows])
 
@@ -63,8 +66,12 @@ class RecordedRun:
         return self._archive.read(section_id)
 
     def section_ids(self) -> list[int]:
-        """Ids of the sections, in order."""
-        return self.folder.section_ids()
+        """Ids of the sections that are whole on disk and in the catalogue, in order."""
+        return list(self._section_ids)
+
+    def frames_in_sections(self) -> list[int]:
+        """The committed frames that belong to one of these sections."""
+        return [frame_id for section_id in self._section_ids for frame_id in self.frames_of(section_id)]
 
     def frames_of(self, section_id: int) -> range:
         """The committed frames of a section, which are consecutive; empty for a section that there is not."""

@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,11 @@ from vtslam.common import metrics
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
 from vtslam.services.evaluation import evaluate_run
+from vtslam.services.film import write_film
 from vtslam.services.recorded_run import RecordedRun
+from vtslam.services.run_view import show_run
+from vtslam.services.viewer.parts import Part
+from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
 
 FRAMES, LENGTH, HOLDOUT = 12, 5, 2
@@ -145,6 +151,44 @@ def test_seams_are_seen_from_the_section_that_ends(room_run: Path) -> None:
     values = evaluate_run(run)
     assert values["psnr_next_db"] == pytest.approx(np.mean(next_db))
     assert values["psnr_last_db"] == pytest.approx(np.mean(last_db))
+
+
+class _Sink:
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+
+    def send(self, frame_id: int, update: Iterable[Part]) -> bool:
+        self.frames += [frame_id] if not self.frames or self.frames[-1] != frame_id else []
+        return True
+
+
+@pytest.mark.parametrize("state", ["cut off", "set aside"])
+def test_sections_that_do_not_count_are_not_looked_at(state: str, room_run: Path, tmp_path: Path) -> None:
+    path, frames = shutil.copytree(room_run, tmp_path / "run"), list(range(10))
+    with RunFolder.open(path, writable=True) as run:
+        if state == "set aside":
+            run.catalog.set_missing(1)
+            run.section_path(1).unlink()
+            frames = [*range(5), 10, 11]
+        else:  # the last section's file is there, and not in the catalogue
+            run.catalog.drop_from(2)
+    recorded = RecordedRun(path)
+    values, sink = evaluate_run(recorded), _Sink()
+    assert values["sections"] == len(recorded.section_ids()) == 2
+    assert [frame["frame"] for frame in values["per_frame"]] == [each for each in (0, 5, 10) if each in frames]  # type: ignore[attr-defined]
+    show_run(recorded, sink, section_gaussians=100, gaussians=1000)
+    assert sink.frames == frames
+    write_film(tmp_path / "film.gif", recorded)
+    assert recorded.frames_in_sections() == frames
+
+
+def test_a_run_without_a_finished_section_cannot_be_filmed(room_run: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(room_run, tmp_path / "run")
+    with RunFolder.open(path, writable=True) as run:
+        for section_id in range(3):
+            run.catalog.set_missing(section_id)
+    with pytest.raises(RunFolderError, match="expected a finished section to film, found none"):
+        write_film(tmp_path / "film.gif", RecordedRun(path))
 
 
 def test_an_existing_run_is_kept_unless_overwriting_is_asked_for(
