@@ -10,7 +10,7 @@ from vtslam.storage.catalog_rows import STORED, SectionRow
 from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import ChecksumMismatch, MalformedSection, StorageError, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.section_codecs import SectionCodec, codec_of_header
+from vtslam.storage.section_codecs import ROUNDING_CODECS, SectionCodec, codec_of_header
 from vtslam.storage.section_facts import file_facts
 from vtslam.storage.section_file import read_columns, read_section, verify_file, write_section
 from vtslam.storage.section_record import SectionRecord
@@ -101,9 +101,12 @@ def pack_ahead(run: RunFolder, section_id: int, *, codec: SectionCodec, grid: De
 
 
 def repack_all(run: RunFolder, codec: SectionCodec, grid: DenseGrid | None = None) -> None:
-    """Bring the files of all sections on disk into ``codec``, those packed ahead at little cost; see :func:`repack`."""
+    """Bring the files of all sections on disk into ``codec``, those packed ahead at little cost; see :func:`repack`.
+
+    What is rounded already stays so: no other codec would bring it back, and its name would say that none was lost.
+    """
     for row in run.catalog.sections():
-        if row.state == STORED and row.codec != codec:
+        if row.state == STORED and row.codec not in (codec, *ROUNDING_CODECS):
             repack(run, row.section_id, codec=codec, grid=grid, is_packed=_is_packed(run, row.section_id, codec))
     run.remove_packed()
 

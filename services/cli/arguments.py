@@ -194,7 +194,7 @@ def _add_sections(commands: "_Commands[argparse.ArgumentParser]") -> None:
     actions.add_parser("ls", help="what is there, from the catalogue")
     actions.add_parser("verify", help="read every section and hold it against the catalogue")
     actions.add_parser("repair", help="finish what was cut off, set damaged files aside (RUN/damaged)")
-    repack = actions.add_parser("repack", help="write all sections anew with another codec")
+    repack = actions.add_parser("repack", help="write all sections anew with another codec; fast and dense round")
     repack.add_argument("--codec", default="dense", metavar="NAME", help="the codec (default: %(default)s)")
     for action in actions.choices.values():
         action.add_argument("run", type=Path, metavar="RUN", help="a run folder")
