@@ -12,10 +12,12 @@ from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.pacing import Pacing
+from vtslam.services.recorded_run import holds_every_frame
 from vtslam.services.run_plan import RunPlan, plan_resume, plan_run
 from vtslam.services.run_record import RunSummary
 from vtslam.services.viewer.rerun_process import page_url
 from vtslam.storage.errors import WriteFailed
+from vtslam.storage.run_folder import RunFolder
 
 
 def run_command(args: Namespace) -> int:
@@ -35,9 +37,15 @@ def run_command(args: Namespace) -> int:
             summary = _watched(args, plan, out, stop)
         except WriteFailed as error:
             raise type(error)(f"{error}; what was stored is kept: vtslam run --resume {out}") from error
-    console.print(f"{summary_text(summary)}\nrun folder: {out}   (next: vtslam eval {out})")
+    console.print(f"{summary_text(summary)}\nrun folder: {out}{_hint(out)}")
     console.result({"run": str(out.resolve()), "source": plan.source.uri, **asdict(summary)})
     return stop.exit_status if summary.interrupted else 0
+
+
+def _hint(out: Path) -> str:
+    """What to do next, if that can be done."""
+    with RunFolder.open(out) as run:
+        return f"   (next: vtslam eval {out})" if holds_every_frame(run) else ""
 
 
 def say_page(console: Console, settings: Settings) -> None:
