@@ -9,6 +9,7 @@ SOURCE_HELP = (
     "where frames come from: replica:DIR, 7scenes:DIR, tum:DIR, scannet:DIR|FILE.sens, scannetpp:DIR, "
     "realsense:, kitti:DIR, mcap:FILE, sim:room, sim:city"
 )
+DEFAULT_PRESET = "fast"
 WEB_PORT = 9090
 VIEW_ASSIGNMENT = f"viewer.web_port={WEB_PORT}"  # what --view stands for
 _JSON_HELP = "write the result as JSON (- for standard output)"
@@ -93,6 +94,7 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     _add_viewing(command)
     _add_poses(command)
     _add_layers(command)
+    command.set_defaults(preset=None)  # so that it is known whether one was asked for
     _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
@@ -168,9 +170,7 @@ def _add_view(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--live", action="store_true", help="a running fleet instead")
     command.add_argument("--fleet", metavar="NAME", help="its name (default: the only one of this user)")
     command.add_argument("--web", action="store_true", help="serve a page on 127.0.0.1, not a window")
-    command.add_argument(
-        "--port", type=int, default=WEB_PORT, metavar="N", help="of that page; its data take N+1 (default: %(default)s)"
-    )
+    command.add_argument("--port", type=int, metavar="N", help=f"of that page; its data take N+1 (default: {WEB_PORT})")
     command.add_argument("--save", type=Path, metavar="FILE", help="keep it in a file (.rrd) instead, or beside --web")
     command.add_argument("--film", type=Path, metavar="FILE", help="only draw how the map grew (.webp, .gif)")
 
@@ -297,7 +297,10 @@ def _add_pacing(command: argparse.ArgumentParser, *, default: str) -> None:
 
 def _add_layers(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--preset", default="fast", metavar="P", help="schedule: fast, paper, released, realtime (default: %(default)s)"
+        "--preset",
+        default=DEFAULT_PRESET,
+        metavar="P",
+        help="schedule: fast, paper, released, realtime (default: fast)",
     )
     command.add_argument(
         "--family",

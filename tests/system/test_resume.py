@@ -106,6 +106,8 @@ def test_a_fleet_killed_as_a_whole_goes_on_twice(small: SmallRecording, tmp_path
         (["run", "sim:room"], "run: expected SOURCE and --out RUN, or --resume RUN"),
         (["run", "sim:room", "--resume", "RUN"], "goes on with the run's own source and settings"),
         (["run", "--resume", "RUN", "--holdout", "3"], "goes on with the run's own source and settings"),
+        (["run", "--resume", "RUN", "--preset", "fast"], "goes on with the run's own source and settings"),
+        (["run", "--resume", "RUN", "--family", "kitti"], "goes on with the run's own source and settings"),
         (["run", "--resume", "RUN", "--record", "x.mcap"], "a run that records goes on recording"),
     ],
 )

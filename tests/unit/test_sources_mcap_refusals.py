@@ -190,6 +190,14 @@ def test_odd_options_are_refused(options: dict[str, str], text: str, tmp_path: P
         open_source(f"mcap:{path}", overrides=options)
 
 
+@pytest.mark.parametrize("option", ["depth_scale=500", "tolerance_ms=3", "stamp=log"])
+def test_options_that_this_program_records_are_refused_of_its_recordings(option: str, tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "x.mcap", frames(2))
+    name = option.partition("=")[0]
+    with pytest.raises(SourceError, match=f"x.mcap: option {name}: expected for recordings of others, found one of"):
+        open_source(f"mcap:{path}?{option}")
+
+
 def test_bags_without_intrinsics_or_with_odd_ones_are_refused(tmp_path: Path) -> None:
     frame = frames(1)[0]
     for fx, width, text in (

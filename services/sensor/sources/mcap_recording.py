@@ -145,6 +145,8 @@ def open_mcap(uri: SourceUri) -> McapRecording:
         depth = mcap_topics.chosen_topic(file, "depth", uri.options.get("depth"))
         facts = depth.channel.metadata
         is_own = topics.DEPTH_SCALE_KEY in facts
+        if is_own:
+            _refuse_options_of_others(uri, path)
         by_log_time = is_own or _choice(uri, "stamp", ("header", "log")) == "log"
         color_ns = mcap_topics.image_times_ns(file, color, by_log_time=by_log_time)
         depth_ns = mcap_topics.image_times_ns(file, depth, by_log_time=by_log_time)
@@ -165,6 +167,13 @@ def open_mcap(uri: SourceUri) -> McapRecording:
             times_ns=color_ns[pairs[:, 0]],
             world=uri.options.get("world"),
         )
+
+
+def _refuse_options_of_others(uri: SourceUri, path: Path) -> None:
+    """Refuse options that say what a recording of this program says itself."""
+    given = [key for key in ("depth_scale", "tolerance_ms", "stamp") if key in uri.options]
+    if given:
+        raise SourceError(f"{path}: option {given[0]}: expected for recordings of others, found one of this program")
 
 
 def _camera(uri: SourceUri, file: McapFile, color: Topic) -> Camera:
