@@ -71,9 +71,11 @@ def repair(run: RunFolder) -> list[str]:
 
 def require_intact(run: RunFolder, row: SectionRow) -> None:
     """Raise StorageError unless a section's file is, by its size and footer, the one of the catalogue."""
-    path, advice = run.section_path(row.section_id), f"(vtslam sections repair {run.path} sets it aside)"
+    path = run.section_path(row.section_id)
     found = file_facts(path)
     if (found.num_bytes, found.sha256) != (row.num_bytes, row.sha256):
+        is_next = found.sha256 == row.next_sha256  # a repacking was cut off
+        advice = f"(vtslam sections repair {run.path} {'brings it in order' if is_next else 'sets it aside'})"
         raise ChecksumMismatch.differing(
             path,
             "file",
@@ -195,12 +197,14 @@ def _finished_replacing(run: RunFolder, row: SectionRow) -> str | None:
         return None
     path = run.section_path(row.section_id)
     try:
-        found = file_facts(path)
+        found, codec = file_facts(path), codec_of_header(read_columns(path, [])[0])
     except StorageError:
         return None  # told of by the examination that follows
     is_new = found.sha256 == row.next_sha256
-    sha256, num_bytes = (found.sha256, found.num_bytes) if is_new else (row.sha256, row.num_bytes)
-    run.catalog.set_file(row.section_id, sha256=sha256, num_bytes=num_bytes, codec=row.codec)
+    if is_new:
+        run.catalog.set_file(row.section_id, sha256=found.sha256, num_bytes=found.num_bytes, codec=codec)
+    else:
+        run.catalog.set_file(row.section_id, sha256=row.sha256, num_bytes=row.num_bytes, codec=row.codec)
     return f"{path}: repacking was cut off; the {'new' if is_new else 'former'} file counts"
 
 
