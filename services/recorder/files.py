@@ -32,6 +32,8 @@ def check_way(settings: RecorderSettings, *, overwrite: bool, used: Sequence[str
     path = Path(settings.file)
     if not path.parent.is_dir():
         raise WriteFailed(f"{path}: expected a folder for the recording, found none")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise WriteFailed(f"{path}: expected a folder that can be written, found one that cannot")
     for part in _parts(path):
         if not part.is_file():
             raise WriteFailed(f"{part}: expected a file to record in, found no regular file")

@@ -55,6 +55,12 @@ def test_folders_and_files_that_are_used_are_refused(tmp_path: Path) -> None:
         check_way(RecorderSettings(file=str(tmp_path / "nowhere/r.mcap")), overwrite=True)
 
 
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # to the superuser all can be
+    with pytest.raises(WriteFailed, match=r"r\.mcap: expected a folder that can be written, found one that cannot"):
+        check_way(RecorderSettings(file=str(tmp_path / "r.mcap")), overwrite=True)
+
+
 def test_a_fleet_that_cannot_be_joined_costs_no_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
