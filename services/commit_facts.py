@@ -3,6 +3,7 @@
 import json
 import zlib
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -87,9 +88,15 @@ class CommitFacts:
             iterations=plain["iterations"],
             frame=CommittedFrame.from_plain(plain["frame"]),
             T_world_previous=None if before is None else np.array(before, np.float64),
-            history=TrackerHistory(**{name: tuple(values) for name, values in plain["history"].items()}),
+            history=_history_of(plain["history"]),
             pixels_crc32=plain["pixels_crc32"],
         )
+
+
+def _history_of(plain: dict[str, Any]) -> TrackerHistory:
+    """The history of a JSON object; of an earlier version's it lacks what has a default."""
+    values: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in plain.items()}
+    return TrackerHistory(**values)
 
 
 def pixels_crc32(frame: Frame) -> int:

@@ -17,7 +17,7 @@ from vtslam.services.recorded_run import RecordedRun
 from vtslam.services.report_pictures import Picture, beside, labelled, stacked
 from vtslam.services.viewer.sampling import kept_rows
 from vtslam.storage.atomic import replace_file
-from vtslam.storage.errors import WriteFailed
+from vtslam.storage.errors import RunFolderError, WriteFailed
 
 MOST_PICTURES = 75
 _MOST_GAUSSIANS = 400_000
@@ -59,8 +59,11 @@ def write_film(path: Path, run: RecordedRun, *, on_picture: Callable[[], None] =
     """
     if path.suffix not in (".webp", ".gif"):
         raise WriteFailed(f"{path}: expected a name that ends in .webp or .gif")
-    last = run.num_frames - 1
-    shown = sorted({int(each) for each in np.linspace(0, last, min(MOST_PICTURES, run.num_frames))})
+    frames = run.frames_in_sections()
+    if not frames:
+        raise RunFolderError(f"{run.folder.path}: expected a finished section to film, found none")
+    shown = sorted({frames[int(each)] for each in np.linspace(0, len(frames) - 1, min(MOST_PICTURES, len(frames)))})
+    last = frames[-1]
     splat_map, pictures = _map_of(run), []
     view = onlooker(splat_map.splats.means_m, run.poses, splat_map.center_m, _MAP_SIZE)
     for frame_id in shown:

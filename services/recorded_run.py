@@ -16,6 +16,8 @@ from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Rendering
 from vtslam.services.engines import make_engine
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.services.supervisor.processes import LIVE_SOURCE
+from vtslam.storage.catalog_rows import STORED
 from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
@@ -44,12 +46,19 @@ class RecordedRun:
     def __init__(self, path: Path) -> None:
         self.folder = RunFolder.open(path)
         self.info = self.folder.read_info()
+        if self.info.facts.source == LIVE_SOURCE:
+            raise RunFolderError(
+                f"{path}: publishers fed this run, and their frames, which its map is held against, are gone; "
+                "record the next one (vtslam up --record FILE)"
+            )
         self.settings: Settings = load(Settings, [(f"{path / 'run.toml'} [settings]", self.info.settings)])
         self.source = open_source(self.info.facts.source)
         self._engine = make_engine(self.settings.splat)
         self._archive = SectionArchive(self.folder)
+        # Sections first: of a run that goes on, what comes after them may be longer, and never shorter.
+        self._section_ids = [row.section_id for row in self.folder.catalog.sections() if row.state == STORED]
         self.rows: list[dict[str, Any]] = self.folder.read_frames()
-        self.poses = self.folder.catalog.poses()[1]
+        self.poses = self.folder.catalog.poses()[1][: len(self.rows)]
         self._check()
         self._frames_of = _ranges([row["section_id"] for row in self.rows])
 
@@ -63,8 +72,12 @@ class RecordedRun:
         return self._archive.read(section_id)
 
     def section_ids(self) -> list[int]:
-        """Ids of the sections, in order."""
-        return self.folder.section_ids()
+        """Ids of the sections that are whole on disk and in the catalogue, in order."""
+        return list(self._section_ids)
+
+    def frames_in_sections(self) -> list[int]:
+        """The committed frames that belong to one of these sections."""
+        return [frame_id for section_id in self._section_ids for frame_id in self.frames_of(section_id)]
 
     def frames_of(self, section_id: int) -> range:
         """The committed frames of a section, which are consecutive; empty for a section that there is not."""
@@ -103,8 +116,18 @@ class RecordedRun:
             )
         if not self.rows:
             raise RunFolderError(f"{self.folder.path}: no frame was committed; nothing to evaluate")
-        if [row.get("frame_id") for row in self.rows] != list(range(len(self.rows))):
-            raise RunFolderError(f"{self.folder.path}: expected frames 0, 1, 2, ... in order, found others")
+        frame_ids = [row["frame_id"] for row in self.rows]
+        if frame_ids != list(range(len(frame_ids))):
+            raise RunFolderError(
+                f"{self.folder.path}: expected every frame up to frame {frame_ids[-1]}, found {len(frame_ids)} of "
+                f"{frame_ids[-1] + 1}: a run that leaves frames out, as --pacing realtime does to keep up with time, "
+                "cannot be looked at or judged"
+            )
+
+
+def holds_every_frame(run: RunFolder) -> bool:
+    """Whether a run mapped frames, and left none of them out."""
+    return 0 < run.catalog.num_frames == run.catalog.last_frame_id + 1
 
 
 def _ranges(section_ids: list[int]) -> dict[int, range]:

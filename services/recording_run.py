@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from vtslam.common.frame import Frame
 from vtslam.common.section import Section
 from vtslam.common.settings import Settings
 from vtslam.common.splat.engine import Engine
@@ -27,6 +28,7 @@ from vtslam.services.run_record import RunRecord, RunSummary
 from vtslam.services.sensor.sources.base import Source, SourceError
 from vtslam.services.sensor.sources.read_ahead import ReadAhead
 from vtslam.services.system import FrameReport, Seal, System
+from vtslam.services.tracker.priors import ignored_text
 from vtslam.services.tracker.state import TrackerState
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
@@ -104,7 +106,7 @@ class _Recorder:
         recording: "RecordingWriter | None",
     ) -> None:
         self._start_s = time.perf_counter()
-        self._recording = recording
+        self._run, self._recording, self._told = run, recording, False
         self._archive = _RecentArchive(run)
         self._system = System(
             settings, engine, self._archive, threads=thread_count(settings.splat), clock=time.perf_counter
@@ -123,6 +125,7 @@ class _Recorder:
         read_s = time.perf_counter() - start_s
         if self._recording is not None:
             self._recording.add_frame(frame)
+        self._tell_of_ignored(frame)
         report = self._system.process(frame, known_T_world_camera=known_T_world_camera)
         facts = _facts_of(report, read_s=read_s, total_s=time.perf_counter() - start_s)
         T_world_camera = report.commit.T_world_camera
@@ -135,6 +138,12 @@ class _Recorder:
         if report.sealed is not None:
             self._commit()
         return facts
+
+    def _tell_of_ignored(self, frame: Frame) -> None:
+        """Note once that poses that come with frames do not count."""
+        if not self._told and frame.pose_prior is not None and self._system.state.prior_of(frame) is None:
+            self._told = True
+            self._run.catalog.add_event("priors", ignored_text(frame))
 
     def close(self, *, finished: bool, interrupted: bool) -> RunSummary:
         """Write the open section and everything else that is not written yet."""

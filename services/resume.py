@@ -1,6 +1,7 @@
 """Where a run that was cut off goes on: the end of its last durable section, with all that crosses a frame boundary."""
 
 from dataclasses import dataclass
+from itertools import takewhile
 
 from vtslam.common.frame import Frame
 from vtslam.common.section_end import SectionEnd
@@ -10,6 +11,7 @@ from vtslam.storage.catalog_rows import STORED, SectionRow
 from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_care import require_intact
+from vtslam.storage.section_codecs import ROUNDING_CODECS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,22 +44,35 @@ def prepare_to_resume(run: RunFolder, source: Source, *, end: SectionEnd) -> Res
         Where to go on; None for the beginning.
 
     Raises:
-        StorageError: A section's file is not what the catalogue says, or nothing is known to go on from.
-        SourceError: The last frame cannot be read.
+        StorageError: A section's file is not what the catalogue says or was rounded, the recording is another one, or
+            nothing is known to go on from. The folder is as it was.
+        SourceError: The last frame cannot be read, and the folder is as it was.
     """
-    last: SectionRow | None = None
-    before: SectionRow | None = None
-    for row in run.catalog.sections():
-        if row.state != STORED:
-            break
-        require_intact(run, row)
-        last, before = row, last
-    if last is not None and not _is_whole(run, last, source, end):
-        last = before  # those before it are: the run went on after them
-    run.drop_sections(0 if last is None else last.section_id + 1)
+    kept = _kept_sections(run, source, end)
+    point = _point_after(run, kept[-1], source) if kept else None
+    run.drop_sections(len(kept))
     run.remove_derived()
-    if last is None:
-        return None
+    return point
+
+
+def _kept_sections(run: RunFolder, source: Source, end: SectionEnd) -> list[SectionRow]:
+    """The sections that the run goes on after, from the first on."""
+    kept = list(takewhile(lambda row: row.state == STORED, run.catalog.sections()))
+    for row in kept:
+        require_intact(run, row)
+    if kept and not _is_whole(run, kept[-1], source, end):
+        kept.pop()  # those before it are: the run went on after them
+    rounded = next((row for row in kept if row.codec in ROUNDING_CODECS), None)
+    if rounded is not None and kept[-1].end_frame_id != len(source):
+        raise RunFolderError(
+            f"{run.section_path(rounded.section_id)}: expected what was mapped, to go on from, found it rounded by the "
+            f"codec {rounded.codec}: the result would be another one; run it again"
+        )
+    return kept
+
+
+def _point_after(run: RunFolder, last: SectionRow, source: Source) -> ResumePoint:
+    """The end of a section, if the recording is the one that was mapped."""
     packed = run.catalog.resume_record(last.section_id)
     if packed is None:
         raise RunFolderError(f"{run.path}: section {last.section_id} holds nothing to go on from; run it again")

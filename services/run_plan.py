@@ -1,6 +1,7 @@
 """A run before it starts: source, settings and engine, all checked, so that nothing is refused half-way."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +18,12 @@ from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.pacing import pace_of
 from vtslam.services.process_facts import program_version, versions
-from vtslam.services.recorder.files import make_way, maybe_recording
+from vtslam.services.recorder.files import check_way, make_way, maybe_recording
 from vtslam.services.recording_run import run_recording
 from vtslam.services.resume import ResumePoint, prepare_to_resume
 from vtslam.services.run_record import RunRecord, RunSummary
-from vtslam.services.sensor.sources.base import Source, SourceError, live_camera
+from vtslam.services.sensor.sources.base import Source, SourceError, SourceUri, live_camera
+from vtslam.services.sensor.sources.pose_priors import OPTIONS as POSE_OPTIONS
 from vtslam.services.sensor.sources.registry import open_source
 from vtslam.services.supervisor.processes import LIVE_SOURCE
 from vtslam.storage.errors import RunFolderError
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from vtslam.services.supervisor.fleet_run import FleetHooks
 
 DEFAULT_PRESET = "fast"
+_FRAMES_LOOKED_AT = 500  # for the first one with a pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,9 +78,8 @@ class RunPlan:
             StorageError: The folder cannot be made or written.
             SourceError: A frame cannot be read; what was done before it is kept.
         """
-        make_way(self.settings.recorder, overwrite=overwrite)
         with (
-            RunFolder.create(folder, self.info(created_by), overwrite=overwrite) as run,
+            self._made_folder(folder, self.info(created_by), overwrite=overwrite) as run,
             maybe_recording(self.settings.recorder, family=self.family) as recording,
         ):
             return run_recording(
@@ -147,9 +149,16 @@ class RunPlan:
         """
         from vtslam.services.supervisor.fleet_run import run_in_fleet
 
-        make_way(self.settings.recorder, overwrite=overwrite)
-        with RunFolder.create(folder, self.info(), overwrite=overwrite) as run:
+        with self._made_folder(folder, self.info(), overwrite=overwrite) as run:
             return run_in_fleet(run, self.settings, hooks)
+
+    @contextmanager
+    def _made_folder(self, folder: Path, info: RunInfo, *, overwrite: bool) -> Iterator[RunFolder]:
+        """A new run folder; an earlier recording goes only once that is made and so nothing is refused any more."""
+        check_way(self.settings.recorder, overwrite=overwrite, used=SourceUri.parse(self.source.uri).files())
+        with RunFolder.create(folder, info, overwrite=overwrite) as run:
+            make_way(self.settings.recorder, overwrite=overwrite)
+            yield run
 
     def info(self, created_by: str | None = None) -> RunInfo:
         """What ``run.toml`` says at the start; ``created_by`` is this program and its version if None."""
@@ -185,7 +194,7 @@ def plan_run(
         assignments: ``key=value`` texts.
 
     Raises:
-        ConfigError: A setting is refused.
+        ConfigError: A setting is refused, or poses are given but none for the first frame.
         SourceError: The source cannot be opened, or has no such option, size or range.
     """
     # The source's own family is known once it is open, and how to open it is a setting, which families leave alone.
@@ -198,13 +207,27 @@ def plan_run(
         )
     family = family or source.family
     settings = load_settings(preset=preset, family=family, file=config, assignments=assignments)
-    if not settings.tracker.enabled and source.frame(0).pose_prior is None:
-        raise ConfigError(f"--tracking off: {source.uri}: expected a pose for the first frame (--poses), found none")
+    _check_first_pose(source, settings)
     budget_mb, least_mb = settings.fleet.map_budget_mb, least_budget_mb(settings, source.camera)
     if budget_mb < least_mb:
         size = f"{source.camera.width}x{source.camera.height}"
         raise ConfigError(f"fleet.map_budget_mb = {budget_mb}: expected at least {least_mb} for frames of {size}")
     return RunPlan(source=source, settings=settings, engine=make_engine(settings.splat), preset=preset, family=family)
+
+
+def _check_first_pose(source: Source, settings: Settings) -> None:
+    """Refuse a first frame without a pose where poses are given: the world would not be that of the later ones'."""
+    options = SourceUri.parse(source.uri).options
+    has_poses = not options.keys().isdisjoint(POSE_OPTIONS)
+    if (settings.tracker.enabled and not has_poses) or source.frame(0).pose_prior is not None:
+        return
+    if not has_poses:
+        raise ConfigError(f"--tracking off: {source.uri}: expected a pose for the first frame (--poses), found none")
+    looked_at = min(len(source), _FRAMES_LOOKED_AT)
+    found = next((index for index in range(1, looked_at) if source.frame(index).pose_prior is not None), None)
+    first, _, end = options.get("range", "0:").partition(":")
+    told = f"none for the first {looked_at}" if found is None else f"none before --frames {int(first) + found}:{end}"
+    raise ConfigError(f"{source.uri}: expected a pose for the first frame, which says where the world is, found {told}")
 
 
 def plan_resume(folder: Path) -> RunPlan:

@@ -1,7 +1,7 @@
 """The whole system in one process: frames in, poses and sections out. The cores are those of the fleet's processes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -105,14 +105,16 @@ class System:
         """Track and map the next frame; seals its section if it is the last of it.
 
         Args:
-            frame: The frame; a pose prior that comes with it is weighed by its covariance.
+            frame: The frame; a pose prior that comes with it is weighed by its covariance, unless the first frame had
+                neither a prior nor a known pose: its world is then its own.
             known_T_world_camera: float64 [4,4], its pose if that is known: it is mapped there, not tracked.
         """
         section_id, row = self._num_sections, 0 if self.active is None else len(self.active.section.frames)
         tracking, start_s, budget_s = None, self._clock(), self.settings.mapper.budget_s
-        if known_T_world_camera is None and self._tracker.tracks(frame, is_first=self._frames == 0):
+        prior, is_first = self._state.prior_of(frame), self._frames == 0
+        if known_T_world_camera is None and self._tracker.tracks(prior, is_first=is_first):
             tracking = self._tracker.track(
-                frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
+                frame, self.map, self._state, section_id=section_id, is_head=row == 0, prior=prior
             )
         if known_T_world_camera is not None:
             T_world_camera = known_T_world_camera
@@ -131,6 +133,8 @@ class System:
         self._state = self._state.after(
             frame, commit.T_world_camera, tracking, mean_depth_m(frame), exposure=commit.exposure
         )
+        if is_first and known_T_world_camera is not None:
+            self._state = replace(self._state, ignores_priors=False)  # whoever knows the pose knows the world
         self._frames += 1
         is_full = SectionEnd.of(self.settings, frame.camera).is_reached(self.active.section)
         sealed = self._seal() if is_full else None

@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
-from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.overlap.coarse import CoarseDepth
 from vtslam.common.overlap.view_index import ViewFacts
+from vtslam.storage.catalog_connection import connected, translated
 from vtslam.storage.catalog_rows import (
     MISSING,
     Event,
@@ -34,10 +34,9 @@ from vtslam.storage.catalog_rows import (
     unpacked_pose,
 )
 from vtslam.storage.catalog_schema import check_version, migrate
-from vtslam.storage.errors import CatalogError, DiskFull, RunFolderError, StorageError, WriteFailed
+from vtslam.storage.errors import CatalogError, RunFolderError
 from vtslam.storage.section_record import SectionRecord
 
-_WAIT_S = 30.0  # for another process that has the catalogue to itself for a moment
 _FRAMES = """
 SELECT f.frame_id, f.capture_time_ns, f.T_world_committed, q.facts
 FROM frames f JOIN quality q USING (frame_id) ORDER BY f.frame_id"""
@@ -101,10 +100,10 @@ class Catalog:
 
     @classmethod
     def _opened(cls, path: Path, mode: str) -> Self:
-        with _translated(path):
-            connection = _connected(path, mode)
+        with translated(path):
+            connection = connected(path, mode)
         try:
-            with _translated(path):
+            with translated(path):
                 version = 0 if mode == "rwc" else check_version(connection, path)
                 if mode != "ro":
                     connection.execute("PRAGMA journal_mode = WAL")
@@ -316,7 +315,7 @@ class Catalog:
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         """All of what is executed, durably, or nothing."""
-        with _translated(self.path):
+        with translated(self.path):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection
@@ -327,11 +326,11 @@ class Catalog:
                 raise
 
     def _rows(self, sql: str, *values: object) -> list[Any]:
-        with _translated(self.path):
+        with translated(self.path):
             return self._connection.execute(sql, values).fetchall()
 
     def _each(self, sql: str, *values: object) -> Iterator[Any]:
-        with _translated(self.path):
+        with translated(self.path):
             yield from self._connection.execute(sql, values)
 
 
@@ -343,40 +342,6 @@ def _insert_frames(db: sqlite3.Connection, section_id: int, frames: Sequence[Fra
     db.executemany("INSERT INTO frames VALUES (?,?,?,?,?)", rows)
     quality = [(frame.frame_id, text) for frame, text in zip(frames, facts, strict=True)]
     db.executemany("INSERT INTO quality VALUES (?,?)", quality)
-
-
-def _connected(path: Path, mode: str) -> sqlite3.Connection:
-    uri = f"file:{quote(str(path.resolve()))}?mode={mode}"
-    connection = sqlite3.connect(uri, uri=True, timeout=_WAIT_S, isolation_level=None)
-    try:
-        connection.execute("PRAGMA user_version")
-    except sqlite3.OperationalError as error:
-        connection.close()
-        # The index that readers and a writer share cannot be made on a disk that nobody can write: there nobody writes.
-        if mode == "ro" and error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY):
-            return sqlite3.connect(f"{uri}&immutable=1", uri=True, isolation_level=None)
-        raise
-    return connection
-
-
-@contextlib.contextmanager
-def _translated(path: Path) -> Iterator[None]:
-    """SQLite's refusals as those of storage."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise _error_of(path, error) from error
-
-
-def _error_of(path: Path, error: sqlite3.Error) -> StorageError:
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    if code == sqlite3.SQLITE_FULL:
-        return DiskFull(f"{path}: cannot write: no space left on the disk")
-    if code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM):
-        return WriteFailed(f"{path}: cannot write: {error}")
-    if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-        return CatalogError(f"{path}: expected the catalogue of a run, found a damaged file ({error})")
-    return CatalogError(f"{path}: {error}")
 
 
 def _section_values(row: SectionRow) -> tuple[object, ...]:

@@ -10,7 +10,7 @@ from vtslam.storage.catalog_rows import STORED, SectionRow
 from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import ChecksumMismatch, MalformedSection, StorageError, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.section_codecs import SectionCodec, codec_of_header
+from vtslam.storage.section_codecs import ROUNDING_CODECS, SectionCodec, codec_of_header
 from vtslam.storage.section_facts import file_facts
 from vtslam.storage.section_file import read_columns, read_section, verify_file, write_section
 from vtslam.storage.section_record import SectionRecord
@@ -71,9 +71,11 @@ def repair(run: RunFolder) -> list[str]:
 
 def require_intact(run: RunFolder, row: SectionRow) -> None:
     """Raise StorageError unless a section's file is, by its size and footer, the one of the catalogue."""
-    path, advice = run.section_path(row.section_id), f"(vtslam sections repair {run.path} sets it aside)"
+    path = run.section_path(row.section_id)
     found = file_facts(path)
     if (found.num_bytes, found.sha256) != (row.num_bytes, row.sha256):
+        is_next = found.sha256 == row.next_sha256  # a repacking was cut off
+        advice = f"(vtslam sections repair {run.path} {'brings it in order' if is_next else 'sets it aside'})"
         raise ChecksumMismatch.differing(
             path,
             "file",
@@ -101,9 +103,12 @@ def pack_ahead(run: RunFolder, section_id: int, *, codec: SectionCodec, grid: De
 
 
 def repack_all(run: RunFolder, codec: SectionCodec, grid: DenseGrid | None = None) -> None:
-    """Bring the files of all sections on disk into ``codec``, those packed ahead at little cost; see :func:`repack`."""
+    """Bring the files of all sections on disk into ``codec``, those packed ahead at little cost; see :func:`repack`.
+
+    What is rounded already stays so: no other codec would bring it back, and its name would say that none was lost.
+    """
     for row in run.catalog.sections():
-        if row.state == STORED and row.codec != codec:
+        if row.state == STORED and row.codec not in (codec, *ROUNDING_CODECS):
             repack(run, row.section_id, codec=codec, grid=grid, is_packed=_is_packed(run, row.section_id, codec))
     run.remove_packed()
 
@@ -192,12 +197,14 @@ def _finished_replacing(run: RunFolder, row: SectionRow) -> str | None:
         return None
     path = run.section_path(row.section_id)
     try:
-        found = file_facts(path)
+        found, codec = file_facts(path), codec_of_header(read_columns(path, [])[0])
     except StorageError:
         return None  # told of by the examination that follows
     is_new = found.sha256 == row.next_sha256
-    sha256, num_bytes = (found.sha256, found.num_bytes) if is_new else (row.sha256, row.num_bytes)
-    run.catalog.set_file(row.section_id, sha256=sha256, num_bytes=num_bytes, codec=row.codec)
+    if is_new:
+        run.catalog.set_file(row.section_id, sha256=found.sha256, num_bytes=found.num_bytes, codec=codec)
+    else:
+        run.catalog.set_file(row.section_id, sha256=row.sha256, num_bytes=row.num_bytes, codec=row.codec)
     return f"{path}: repacking was cut off; the {'new' if is_new else 'former'} file counts"
 
 

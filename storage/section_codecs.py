@@ -11,6 +11,7 @@ from vtslam.storage.section_record import SectionRecord
 
 SectionCodec = Literal["raw", "lossless", "fast", "dense"]
 SECTION_CODECS: tuple[SectionCodec, ...] = get_args(SectionCodec)
+ROUNDING_CODECS: tuple[SectionCodec, ...] = ("fast", "dense")
 
 AnyArray = npt.NDArray[Any]
 _CODEC_KEY, _GRID_KEY = "codec", "grid"

@@ -48,6 +48,7 @@ class TrackerHistory:
     Attributes:
         color_losses, depth_losses_m: Losses of past frames, newest last, as many of one as of the other.
         largest_mean_depths_m: The largest mean depths of frames, descending.
+        ignores_priors: Whether the first frame came without a pose, so that those of later ones are of another world.
 
     Raises:
         ValueError: There are more losses of one kind than of the other.
@@ -56,6 +57,7 @@ class TrackerHistory:
     color_losses: tuple[float, ...] = ()
     depth_losses_m: tuple[float, ...] = ()
     largest_mean_depths_m: tuple[float, ...] = ()
+    ignores_priors: bool = False
 
     def __post_init__(self) -> None:
         if len(self.color_losses) != len(self.depth_losses_m):
@@ -70,6 +72,7 @@ _HISTORY = Fields(
         "color_losses": Series(MAX_LOSSES),
         "depth_losses_m": Series(MAX_LOSSES),
         "largest_mean_depths_m": Series(MAX_MEAN_DEPTHS),
+        "ignores_priors": Flag(),
     },
 )
 
@@ -94,7 +97,7 @@ class TrackedPose(Message):
     """
 
     KIND: ClassVar[str] = "tracked_pose"
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     frame_id: Count
     capture_time_ns: Count

@@ -9,6 +9,7 @@ SOURCE_HELP = (
     "where frames come from: replica:DIR, 7scenes:DIR, tum:DIR, scannet:DIR|FILE.sens, scannetpp:DIR, "
     "realsense:, kitti:DIR, mcap:FILE, sim:room, sim:city"
 )
+DEFAULT_PRESET = "fast"
 WEB_PORT = 9090
 VIEW_ASSIGNMENT = f"viewer.web_port={WEB_PORT}"  # what --view stands for
 _JSON_HELP = "write the result as JSON (- for standard output)"
@@ -79,7 +80,9 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
         help="one process for all services; the result is that of lockstep",
     )
     command.add_argument("--out", type=Path, metavar="RUN", help="run folder to make")
-    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    command.add_argument(
+        "--overwrite", action="store_true", help="give up an earlier run in RUN, and an earlier recording"
+    )
     command.add_argument(
         "--resume",
         type=Path,
@@ -91,6 +94,7 @@ def _add_run(commands: "_Commands[argparse.ArgumentParser]") -> None:
     _add_viewing(command)
     _add_poses(command)
     _add_layers(command)
+    command.set_defaults(preset=None)  # so that it is known whether one was asked for
     _add_source_shorthands(command)
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
@@ -104,7 +108,9 @@ def _add_up(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to make")
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
-    command.add_argument("--overwrite", action="store_true", help="give up an earlier run in RUN")
+    command.add_argument(
+        "--overwrite", action="store_true", help="give up an earlier run in RUN, and an earlier recording"
+    )
     _add_pacing(command, default="realtime")
     _add_recording(command)
     _add_viewing(command)
@@ -138,7 +144,9 @@ def _add_record(commands: "_Commands[argparse.ArgumentParser]") -> None:
     )
     command.add_argument("--fleet", default="vtslam", metavar="NAME", help="name of the fleet (default: %(default)s)")
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="MCAP file to make")
-    command.add_argument("--overwrite", action="store_true", help="give up an earlier recording")
+    command.add_argument(
+        "--overwrite", action="store_true", help="give up an earlier recording, FILE-2 and so on included"
+    )
     command.add_argument("--color", choices=["png", "jpeg"], default="png", help="png keeps every bit (default)")
     command.add_argument("--json", metavar="FILE", help=_JSON_HELP)
 
@@ -162,9 +170,7 @@ def _add_view(commands: "_Commands[argparse.ArgumentParser]") -> None:
     command.add_argument("--live", action="store_true", help="a running fleet instead")
     command.add_argument("--fleet", metavar="NAME", help="its name (default: the only one of this user)")
     command.add_argument("--web", action="store_true", help="serve a page on 127.0.0.1, not a window")
-    command.add_argument(
-        "--port", type=int, default=WEB_PORT, metavar="N", help="of that page; its data take N+1 (default: %(default)s)"
-    )
+    command.add_argument("--port", type=int, metavar="N", help=f"of that page; its data take N+1 (default: {WEB_PORT})")
     command.add_argument("--save", type=Path, metavar="FILE", help="keep it in a file (.rrd) instead, or beside --web")
     command.add_argument("--film", type=Path, metavar="FILE", help="only draw how the map grew (.webp, .gif)")
 
@@ -188,7 +194,7 @@ def _add_sections(commands: "_Commands[argparse.ArgumentParser]") -> None:
     actions.add_parser("ls", help="what is there, from the catalogue")
     actions.add_parser("verify", help="read every section and hold it against the catalogue")
     actions.add_parser("repair", help="finish what was cut off, set damaged files aside (RUN/damaged)")
-    repack = actions.add_parser("repack", help="write all sections anew with another codec")
+    repack = actions.add_parser("repack", help="write all sections anew with another codec; fast and dense round")
     repack.add_argument("--codec", default="dense", metavar="NAME", help="the codec (default: %(default)s)")
     for action in actions.choices.values():
         action.add_argument("run", type=Path, metavar="RUN", help="a run folder")
@@ -291,7 +297,10 @@ def _add_pacing(command: argparse.ArgumentParser, *, default: str) -> None:
 
 def _add_layers(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--preset", default="fast", metavar="P", help="schedule: fast, paper, released, realtime (default: %(default)s)"
+        "--preset",
+        default=DEFAULT_PRESET,
+        metavar="P",
+        help="schedule: fast, paper, released, realtime (default: fast)",
     )
     command.add_argument(
         "--family",

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+from vtslam.common.config import ConfigError
 from vtslam.common.frame import Frame
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.process_facts import package_version, program_version
@@ -30,19 +31,28 @@ class Finding:
 
 def doctor_command(args: Namespace) -> int:
     """Examine as the arguments say; 0 if all is well."""
+    if args.source is not None and args.gpu:
+        raise ConfigError(f"doctor: expected a recording to look at or --gpu, found {args.source} and --gpu")
     console = Console(args.json)
     if args.source is not None:
         return _examine_source(args.source, console)
     if args.gpu:
-        from vtslam.services.cli.doctor_gpu import run_gpu_doctor
-
-        return run_gpu_doctor(console.text)
+        return _examine_gpu(console)
     findings = []
     for finding in examine():
         findings.append(finding)
         console.print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.name:<10}  {finding.found}")
     console.result({"ok": all(f.ok for f in findings), "findings": [asdict(f) for f in findings]})
     return 0 if all(f.ok for f in findings) else 1
+
+
+def _examine_gpu(console: Console) -> int:
+    """Examine the CUDA engine; the status of `run_gpu_doctor`."""
+    from vtslam.services.cli.doctor_gpu import run_gpu_doctor
+
+    status = run_gpu_doctor(console.text)
+    console.result({"ok": status == 0, "status": status})
+    return status
 
 
 def _examine_source(uri: str, console: Console) -> int:

@@ -12,26 +12,31 @@ from vtslam.common.shm.errors import DamagedBlock, SharedMemoryError
 from vtslam.common.topics import Role
 from vtslam.services.cli.console import Console
 from vtslam.services.cli.stop_request import StopRequest
-from vtslam.services.recorder.files import make_way, open_recording
+from vtslam.services.recorder.files import check_way, make_way, open_recording
 from vtslam.services.recorder.service import RecorderService
+from vtslam.services.sensor.sources.base import SourceUri
 from vtslam.services.service_link import ServiceLink
 from vtslam.storage.run_folder import RunFolder
+from vtslam.storage.run_info import RunInfo
 
 
 def record_command(args: Namespace) -> int:
     """Record a fleet until it ends or somebody asks to stop, both of which are normal ends; the exit status."""
     console, folder = Console(args.json), FleetFolder.open(args.fleet)
     settings = RecorderSettings(file=str(args.out), color=args.color)
-    make_way(settings, overwrite=args.overwrite)
+    info = _run_info(folder)
+    check_way(settings, overwrite=args.overwrite, used=_files_of(info))
     member = Member(fleet=args.fleet, role=Role.RECORDER, name=f"recorder-{os.getpid()}")
-    with join(member, folder.path) as bus, open_recording(settings, family=_family(folder)) as recording:
-        console.print(f"recording fleet {args.fleet} in {args.out}   (Ctrl-C ends it)")
-        link = ServiceLink(bus, 1)
-        service = RecorderService(bus, link, folder, recording)
-        with StopRequest() as stop:
-            follow(service, bus, link, folder, stop)
-        missed = link.counters.get("frames.missed", 0)
-        console.print(f"{recording.num_frames} frames recorded, {missed} missed: {args.out}")
+    with join(member, folder.path) as bus:
+        make_way(settings, overwrite=args.overwrite)
+        with open_recording(settings, family=info.facts.family) as recording:
+            console.print(f"recording fleet {args.fleet} in {args.out}   (Ctrl-C ends it)")
+            link = ServiceLink(bus, 1)
+            service = RecorderService(bus, link, folder, recording)
+            with StopRequest() as stop:
+                follow(service, bus, link, folder, stop)
+            missed = link.counters.get("frames.missed", 0)
+            console.print(f"{recording.num_frames} frames recorded, {missed} missed: {args.out}")
     console.result({"file": str(args.out.resolve()), "frames": recording.num_frames, "missed": missed})
     return 0
 
@@ -55,9 +60,14 @@ def _is_gone(folder: FleetFolder) -> bool:
     return owner is None or not owner.is_alive
 
 
-def _family(folder: FleetFolder) -> str:
+def _run_info(folder: FleetFolder) -> RunInfo:
     owner = read_owner(folder.path)
     if owner is None:
         raise SharedMemoryError(f"{folder.path}: expected a running fleet, found one that is gone")
     with RunFolder.open(Path(owner.run_folder)) as run:
-        return run.read_info().facts.family
+        return run.read_info()
+
+
+def _files_of(info: RunInfo) -> list[str]:
+    """The files that a fleet reads, and the one it records in itself."""
+    return [*SourceUri.parse(info.facts.source).files(), str(info.settings.get("recorder", {}).get("file", ""))]

@@ -8,14 +8,17 @@ from pathlib import Path
 
 from vtslam.common.config import ConfigError
 from vtslam.common.settings import Settings
+from vtslam.services.cli.arguments import DEFAULT_PRESET
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.frame_watch import FrameWatch
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.pacing import Pacing
+from vtslam.services.recorded_run import holds_every_frame
 from vtslam.services.run_plan import RunPlan, plan_resume, plan_run
 from vtslam.services.run_record import RunSummary
 from vtslam.services.viewer.rerun_process import page_url
 from vtslam.storage.errors import WriteFailed
+from vtslam.storage.run_folder import RunFolder
 
 
 def run_command(args: Namespace) -> int:
@@ -35,9 +38,15 @@ def run_command(args: Namespace) -> int:
             summary = _watched(args, plan, out, stop)
         except WriteFailed as error:
             raise type(error)(f"{error}; what was stored is kept: vtslam run --resume {out}") from error
-    console.print(f"{summary_text(summary)}\nrun folder: {out}   (next: vtslam eval {out})")
+    console.print(f"{summary_text(summary)}\nrun folder: {out}{_hint(out)}")
     console.result({"run": str(out.resolve()), "source": plan.source.uri, **asdict(summary)})
     return stop.exit_status if summary.interrupted else 0
+
+
+def _hint(out: Path) -> str:
+    """What to do next, if that can be done."""
+    with RunFolder.open(out) as run:
+        return f"   (next: vtslam eval {out})" if holds_every_frame(run) else ""
 
 
 def say_page(console: Console, settings: Settings) -> None:
@@ -51,7 +60,8 @@ def _checked_out(args: Namespace) -> Path:
     out: Path | None = args.resume or args.out
     if args.resume is None and (args.source is None or out is None):
         raise ConfigError("run: expected SOURCE and --out RUN, or --resume RUN")
-    if args.resume is not None and (args.source or args.out or args.overwrite or args.config or assignments_of(args)):
+    layers = args.preset or args.family or args.config or assignments_of(args)
+    if args.resume is not None and (args.source or args.out or args.overwrite or layers):
         raise ConfigError(
             f"run: --resume {args.resume} goes on with the run's own source and settings, and a run that records goes "
             "on recording; it takes --in-process and --json only"
@@ -62,7 +72,11 @@ def _checked_out(args: Namespace) -> Path:
 
 def _plan(args: Namespace) -> RunPlan:
     return plan_run(
-        args.source, preset=args.preset, family=args.family, config=args.config, assignments=assignments_of(args)
+        args.source,
+        preset=args.preset or DEFAULT_PRESET,
+        family=args.family,
+        config=args.config,
+        assignments=assignments_of(args),
     )
 
 
@@ -114,8 +128,10 @@ def _poses_of(args: Namespace) -> dict[str, str | bool | float]:
     shorthands = {"source.poses": "poses", "source.poses_sigma": "poses_sigma"}
     given = {key: getattr(args, name, None) for key, name in shorthands.items()}
     settings: dict[str, str | bool | float] = {key: value for key, value in given.items() if value is not None}
-    if getattr(args, "tracking", None) == "off":  # such poses are not refined either
-        settings |= {"tracker.enabled": False}
+    tracking = getattr(args, "tracking", None)
+    if tracking is not None:
+        settings |= {"tracker.enabled": tracking == "on"}
+    if tracking == "off":  # such poses are not refined either
         settings |= {"mapper.bundle_rotation_rate": 0.0, "mapper.bundle_translation_rate": 0.0}
     return settings
 

@@ -4,10 +4,12 @@ from argparse import Namespace
 
 from vtslam.common.config import ConfigError
 from vtslam.services.cli.console import Console, Progress
+from vtslam.services.supervisor.processes import LIVE_SOURCE
 from vtslam.storage import section_care
-from vtslam.storage.catalog_rows import SectionRow
+from vtslam.storage.catalog_rows import STORED, SectionRow
+from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.section_codecs import SECTION_CODECS
+from vtslam.storage.section_codecs import ROUNDING_CODECS, SECTION_CODECS
 
 
 def sections_command(args: Namespace) -> int:
@@ -56,7 +58,7 @@ def _advice(args: Namespace, problems: int) -> str:
 def _repair(args: Namespace, console: Console) -> int:
     with RunFolder.open(args.run, writable=True) as run:
         done = section_care.repair(run)
-        missing = [row.section_id for row in run.catalog.sections() if row.state != "stored"]
+        missing = [row.section_id for row in run.catalog.sections() if row.state != STORED]
     for text in done:
         console.print(text)
     console.print(f"{len(done)} repairs")
@@ -71,7 +73,9 @@ def _repack(args: Namespace, console: Console) -> int:
         raise ConfigError(f"--codec: expected one of {', '.join(SECTION_CODECS)}, found {args.codec!r}")
     before = after = 0
     with RunFolder.open(args.run, writable=True) as run:
-        rows = [row for row in run.catalog.sections() if row.state == "stored"]
+        if args.codec in ROUNDING_CODECS:
+            _require_complete(run, args.codec)
+        rows = [row for row in run.catalog.sections() if row.state == STORED]
         with Progress(len(rows), what="repacking", unit="section") as progress:
             for row in rows:
                 sizes = section_care.repack(run, row.section_id, codec=args.codec)
@@ -81,6 +85,17 @@ def _repack(args: Namespace, console: Console) -> int:
     console.print(f"{len(rows)} sections: {before} bytes before, {after} after")
     console.result({"sections": len(rows), "codec": args.codec, "bytes_before": before, "bytes_after": after})
     return 0
+
+
+def _require_complete(run: RunFolder, codec: str) -> None:
+    """Refuse to round sections that a run may go on from: what follows them would be another map."""
+    facts = run.read_info().facts
+    is_whole = facts.finished and all(row.state == STORED for row in run.catalog.sections())
+    if not is_whole and facts.source != LIVE_SOURCE:
+        raise RunFolderError(
+            f"{run.path}: --codec {codec} rounds: expected a finished run, found one that may go on; finish it first "
+            f"(vtslam run --resume {run.path}), or choose raw or lossless"
+        )
 
 
 def _line(row: SectionRow) -> str:

@@ -12,6 +12,7 @@ from vtslam.common.fleet_folder import FleetFolder, read_owner, running_fleets
 from vtslam.common.settings import Settings
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.topics import Role
+from vtslam.services.cli.arguments import WEB_PORT
 from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.record_command import follow
 from vtslam.services.cli.stop_request import StopRequest
@@ -39,8 +40,7 @@ def view_command(args: Namespace) -> int:
     """Show what the arguments say; the exit status."""
     if (args.run is None) == (not args.live):
         raise ConfigError("view: expected either RUN or --live")
-    if args.web and not 0 < args.port < 65535:
-        raise ConfigError(f"--port: expected 1 to 65534, found {args.port}")
+    _check_options(args)
     console = Console(None)
     if args.live:
         return _view_live(args, console)
@@ -48,6 +48,23 @@ def view_command(args: Namespace) -> int:
     if args.film is not None:
         return _film(args, console, run)
     return _view_run(args, console, run)
+
+
+def _check_options(args: Namespace) -> None:
+    """Refuse options that would do nothing."""
+    if args.run is not None and args.fleet is not None:
+        raise ConfigError(f"--fleet {args.fleet}: expected --live beside it, found the run {args.run}")
+    if args.port is not None and not args.web:
+        raise ConfigError(f"--port {args.port}: expected --web beside it, found none")
+    if not 0 < _port(args) < 65535:
+        raise ConfigError(f"--port: expected 1 to 65534, found {args.port}")
+    if args.film is not None and (args.web or args.save is not None):
+        raise ConfigError(f"--film {args.film}: expected alone, found {'--web' if args.web else '--save'} beside it")
+
+
+def _port(args: Namespace) -> int:
+    """The port of the page."""
+    return WEB_PORT if args.port is None else int(args.port)
 
 
 def _film(args: Namespace, console: Console, run: RecordedRun) -> int:
@@ -117,12 +134,12 @@ def _view_live(args: Namespace, console: Console) -> int:
 def _outlets(args: Namespace) -> "Outlets":
     from vtslam.services.viewer.rerun_sink import Outlets
 
-    return Outlets(web_port=args.port if args.web else 0, save=args.save, window=not args.web and args.save is None)
+    return Outlets(web_port=_port(args) if args.web else 0, save=args.save, window=not args.web and args.save is None)
 
 
 def _say_where(args: Namespace, console: Console) -> None:
     if args.web:
-        console.print(f"open {page_url(args.port)}   (Ctrl-C ends it)")
+        console.print(f"open {page_url(_port(args))}   (Ctrl-C ends it)")
     if args.save is not None:
         console.print(f"written to {args.save}   (to look at: rerun {args.save})")
 

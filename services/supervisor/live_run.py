@@ -9,7 +9,7 @@ from vtslam.common.preset_loading import load_settings
 from vtslam.services.engines import engine_versions, make_engine
 from vtslam.services.network import Door
 from vtslam.services.process_facts import program_version, versions
-from vtslam.services.recorder.files import make_way
+from vtslam.services.recorder.files import check_way, make_way
 from vtslam.services.run_record import RunSummary
 from vtslam.services.supervisor.fleet_run import FleetHooks, run_in_fleet
 from vtslam.services.supervisor.processes import LIVE_SOURCE
@@ -59,8 +59,9 @@ def run_live(
         end_frame=0,
     )
     info = RunInfo(facts=facts, settings=to_dict(settings), versions={**versions(), **engine_versions(settings.splat)})
-    make_way(settings.recorder, overwrite=overwrite)
+    check_way(settings.recorder, overwrite=overwrite)
     with RunFolder.create(out, info, overwrite=overwrite) as run:
+        make_way(settings.recorder, overwrite=overwrite)
         summary = run_in_fleet(run, settings, hooks, fleet=fleet, door=door)
         _complete(run, summary)
     return replace(summary, interrupted=False)

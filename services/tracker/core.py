@@ -47,9 +47,9 @@ class Tracker:
     engine: Engine
     threads: int = 1
 
-    def tracks(self, frame: Frame, *, is_first: bool) -> bool:
-        """Whether a frame is tracked: not the first, nor one that is to be mapped at the pose that it comes with."""
-        return not is_first and (self.settings.enabled or frame.pose_prior is None)
+    def tracks(self, prior: ExternalPose | None, *, is_first: bool) -> bool:
+        """Whether a frame with this prior is tracked: not the first, nor one that is to be mapped at its prior."""
+        return not is_first and (self.settings.enabled or prior is None)
 
     def track(
         self,

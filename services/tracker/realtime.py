@@ -22,6 +22,7 @@ from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_ages import PoseAges
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
+from vtslam.services.tracker.priors import told_prior
 from vtslam.services.tracker.state import TrackerState, TrackResult, untracked_pose
 
 _MAX_STEPS_AHEAD = 3.0  # as far as a velocity is trusted, in times of what it was measured over
@@ -102,7 +103,8 @@ class RealtimeTracker:
         active_id, num_frames = self._follower.active_id, self._follower.num_frames
         section_id = self._follower.section_id
         state, result = self._remembered(), None
-        if self._tracker.tracks(frame, is_first=num_frames == 0):
+        prior = told_prior(frame, state, self._link)
+        if self._tracker.tracks(prior, is_first=num_frames == 0):
             result = self._tracker.track(
                 frame,
                 self._follower.map,
@@ -110,7 +112,7 @@ class RealtimeTracker:
                 section_id=section_id,
                 is_head=active_id is None,
                 guess=self._guess(state, frame),
-                prior=frame.pose_prior,
+                prior=prior,
             )
         after = self._remember(state, frame, result)
         self._tracked += 1

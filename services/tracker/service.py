@@ -22,6 +22,7 @@ from vtslam.services.tracker.core import Tracker
 from vtslam.services.tracker.descriptors import Descriptors
 from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
+from vtslam.services.tracker.priors import told_prior
 from vtslam.services.tracker.state import TrackerState, TrackResult, untracked_pose
 
 
@@ -98,9 +99,10 @@ class TrackerService:
         start_ns = self._clock.monotonic_ns()
         frame = self._ring.copied(descriptor)
         state, result = self._state(frame_id, section_id), None
-        if self._tracker.tracks(frame, is_first=frame_id == 0):
+        prior = told_prior(frame, state, self._link)
+        if self._tracker.tracks(prior, is_first=frame_id == 0):
             result = self._tracker.track(
-                frame, self._follower.map, state, section_id=section_id, is_head=row == 0, prior=frame.pose_prior
+                frame, self._follower.map, state, section_id=section_id, is_head=row == 0, prior=prior
             )
         self._ahead = self._after(frame, state, result, section_id)
         self._poses.publish(

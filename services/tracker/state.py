@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
 from vtslam.common.messages.mapping import MAX_LOSSES, MAX_MEAN_DEPTHS, TrackerHistory
@@ -45,6 +46,7 @@ class TrackerState:
         losses: (colour, depth) losses of past frames, newest last, bounded.
         largest_mean_depths_m: The largest per-frame mean depths, descending, bounded.
         exposure: The last frame's; the next one is taken to have the same while it is tracked.
+        ignores_priors: Whether the first frame came without a pose: the world is its own, and not that of later ones'.
     """
 
     committed_poses: tuple[npt.NDArray[np.float64], ...] = ()
@@ -52,6 +54,7 @@ class TrackerState:
     losses: tuple[tuple[float, float], ...] = ()
     largest_mean_depths_m: tuple[float, ...] = ()
     exposure: Exposure = field(default_factory=Exposure.identity)
+    ignores_priors: bool = False
 
     @classmethod
     def resumed(
@@ -68,6 +71,7 @@ class TrackerState:
             losses=tuple(zip(history.color_losses, history.depth_losses_m, strict=True)),
             largest_mean_depths_m=history.largest_mean_depths_m,
             exposure=exposure,
+            ignores_priors=history.ignores_priors,
         )
 
     def history(self) -> TrackerHistory:
@@ -76,7 +80,12 @@ class TrackerState:
             color_losses=tuple(float(color) for color, _ in self.losses),
             depth_losses_m=tuple(float(depth) for _, depth in self.losses),
             largest_mean_depths_m=tuple(float(depth) for depth in self.largest_mean_depths_m),
+            ignores_priors=self.ignores_priors,
         )
+
+    def prior_of(self, frame: Frame) -> ExternalPose | None:
+        """The pose that comes with the next frame, if there is one and its world is the map's."""
+        return None if self.ignores_priors else frame.pose_prior
 
     def constant_velocity_guess(self) -> npt.NDArray[np.float64]:
         """T_t = T_{t-1} T_{t-2}^-1 T_{t-1}; the last pose if there is only one, the identity if there is none."""
@@ -112,6 +121,7 @@ class TrackerState:
             if mean_depth_m > 0
             else self.largest_mean_depths_m,
             exposure=exposure or self.exposure,
+            ignores_priors=self.ignores_priors if self.committed_poses else frame.pose_prior is None,
         )
 
 

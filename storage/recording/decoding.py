@@ -134,8 +134,10 @@ def stamp_of(topic: Topic, data: bytes, where: str) -> int:
     if _is_ros(topic):
         if len(data) < 12:
             raise MalformedRecording(f"{where}: expected a message with a header, found {len(data)} bytes")
-        seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-        return _time_ns(seconds, nanoseconds)
+        try:
+            return _time_ns(*struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4))
+        except ValueError as error:
+            raise MalformedRecording(f"{where}: expected a time stamp, found {error}") from error
     return image_of(topic, data, where).stamp_ns
 
 
@@ -176,9 +178,10 @@ def _is_ros(topic: Topic) -> bool:
 
 
 def _time_ns(seconds: int, nanoseconds: int) -> int:
-    if seconds < 0 or not 0 <= nanoseconds < 10**9:
+    time_ns = seconds * 10**9 + nanoseconds
+    if seconds < 0 or not 0 <= nanoseconds < 10**9 or time_ns >= 2**63:
         raise ValueError(f"a time of {seconds} s and {nanoseconds} ns")
-    return seconds * 10**9 + nanoseconds
+    return time_ns
 
 
 def _ros_time_ns(message: Any) -> int:  # noqa: ANN401

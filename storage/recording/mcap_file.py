@@ -87,11 +87,6 @@ class _Found:
     chunks: list[_ChunkPlace] = field(default_factory=list)
     places: dict[int, "array[int]"] = field(default_factory=dict)  # by channel: time, chunk, offset, time, ...
 
-    def add(self, channel_id: int, log_time_ns: int, chunk: int, offset: int) -> None:
-        if log_time_ns >= 2**63:
-            raise ValueError(f"a log time of {log_time_ns} ns")
-        self.places.setdefault(channel_id, array("q")).extend((log_time_ns, chunk, offset))
-
 
 class McapFile:
     """An MCAP file, open for reading as long as somebody has it.
@@ -200,7 +195,7 @@ class McapFile:
         for log_time_ns, offset in index.records:
             if offset >= self._found.chunks[chunk].size:
                 raise self._malformed(f"at {start}", "messages within their chunk", f"one at {offset}")
-            self._found.add(index.channel_id, log_time_ns, chunk, offset)
+            self._note(index.channel_id, log_time_ns, chunk, offset, where=f"at {start}")
         return -1
 
     def _look_into(self, chunk: int, *, places: bool = True) -> None:
@@ -227,10 +222,13 @@ class McapFile:
             if len(content) < _MESSAGE_HEAD.size:
                 raise self._malformed(where, "a message", f"{len(content)} bytes")
             channel_id, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(content)
-            try:
-                self._found.add(channel_id, log_time_ns, chunk, offset)
-            except ValueError as error:
-                raise self._malformed(where, "a time of less than 2**63 ns", str(error)) from error
+            self._note(channel_id, log_time_ns, chunk, offset, where=where)
+
+    def _note(self, channel_id: int, log_time_ns: int, chunk: int, offset: int, *, where: str) -> None:
+        """Keep where a message is."""
+        if log_time_ns >= 2**63:
+            raise self._malformed(where, "a time of less than 2**63 ns", f"a log time of {log_time_ns} ns")
+        self._found.places.setdefault(channel_id, array("q")).extend((log_time_ns, chunk, offset))
 
     def _topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}

@@ -138,6 +138,7 @@ def _tracked(rng: np.random.Generator) -> Message:
             color_losses=tuple(rng.uniform(size=4).tolist()),
             depth_losses_m=tuple(rng.uniform(size=4).tolist()),
             largest_mean_depths_m=tuple(rng.uniform(size=3).tolist()),
+            ignores_priors=bool(rng.integers(2)),
         ),
         read_s=float(rng.uniform()),
         track_s=float(rng.uniform()),

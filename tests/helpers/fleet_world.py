@@ -45,6 +45,7 @@ from vtslam.storage.run_info import RunFacts, RunInfo
 from vtslam.storage.section_convert import SectionArchive
 
 FRAMES, SIZE = 5, (20, 15)
+PRIORS = (0, 1, 3)  # frames that come with a pose
 TIMEOUT_S = 600.0  # simulated
 
 
@@ -84,12 +85,14 @@ ENGINE = NativeEngine(threads=1)
 
 
 class FewFrames:
-    """A source in memory; some frames have a pose prior."""
+    """A source in memory; the frames ``priors`` have a pose prior."""
 
     uri, family = "few:", "tum"
 
-    def __init__(self, frames: int = FRAMES, path: int = 48, size: tuple[int, int] = SIZE) -> None:
-        self._frames, self._path, self._size = frames, path, size
+    def __init__(
+        self, frames: int = FRAMES, path: int = 48, size: tuple[int, int] = SIZE, priors: tuple[int, ...] = PRIORS
+    ) -> None:
+        self._frames, self._path, self._size, self._priors = frames, path, size, priors
 
     def __len__(self) -> int:
         return self._frames
@@ -97,7 +100,7 @@ class FewFrames:
     def frame(self, index: int) -> Frame:
         frame = room_frame(index, self._path, self._size)
         prior = ExternalPose(T_world_camera=room_pose(index, self._path), covariance=1e-4 * np.eye(6))
-        return replace(frame, pose_prior=prior if index in (0, 1, 3) else None)
+        return replace(frame, pose_prior=prior if index in self._priors else None)
 
     @property
     def camera(self) -> Camera:
@@ -156,6 +159,7 @@ class Stream:
     frames: int = FRAMES
     path: int = 48
     size: tuple[int, int] = SIZE
+    priors: tuple[int, ...] = PRIORS
     settings: Settings = SETTINGS
     pace: Pace = field(default_factory=Pace)
     archiver: "Archiving | None" = None
@@ -184,7 +188,7 @@ class FleetWorld:
     ) -> None:
         stream = stream or Stream()
         self._pace, self._settings = stream.pace, stream.settings
-        self._source = FewFrames(stream.frames, stream.path, stream.size)
+        self._source = FewFrames(stream.frames, stream.path, stream.size, stream.priors)
         self.world = MemoryWorld(schedule, kills=kills)
         self._folder = folder
         self._archiving = stream.archiver

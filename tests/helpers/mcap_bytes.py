@@ -71,6 +71,10 @@ def _header(time_ns: int, frame_id: str) -> Any:  # noqa: ANN401
     return TYPES.types["std_msgs/msg/Header"](stamp=_stamp(time_ns), frame_id=frame_id)
 
 
+def _matrix(camera: Camera) -> np.ndarray:
+    return np.array([camera.fx, 0, camera.cx - 0.5, 0, camera.fy, camera.cy - 0.5, 0, 0, 1], np.float64)
+
+
 @dataclass(slots=True)
 class BagWriter:
     """A ROS 2 bag in one MCAP file, as rosbag2 writes them; messages are encoded by rosbags.
@@ -127,9 +131,16 @@ class BagWriter:
         self.add(topic, "sensor_msgs/msg/CompressedImage", message, time_ns)
 
     def add_calibration(
-        self, topic: str, camera: Camera, time_ns: int, *, distortion: Sequence[float] = (0.0,) * 5
+        self,
+        topic: str,
+        camera: Camera,
+        time_ns: int,
+        *,
+        distortion: Sequence[float] = (0.0,) * 5,
+        rectified: Camera | None = None,
     ) -> None:
-        k = np.array([camera.fx, 0, camera.cx - 0.5, 0, camera.fy, camera.cy - 0.5, 0, 0, 1], np.float64)
+        """A ``sensor_msgs/CameraInfo``; P is that of ``rectified``, or else K."""
+        k, p = _matrix(camera), _matrix(rectified or camera)
         roi = TYPES.types["sensor_msgs/msg/RegionOfInterest"](
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
@@ -141,7 +152,7 @@ class BagWriter:
             d=np.array(distortion, np.float64),
             k=k,
             r=np.eye(3).ravel(),
-            p=np.concatenate([k.reshape(3, 3), np.zeros((3, 1))], axis=1).ravel(),
+            p=np.concatenate([p.reshape(3, 3), np.zeros((3, 1))], axis=1).ravel(),
             binning_x=0,
             binning_y=0,
             roi=roi,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from helpers.fleet_watching import Slow, Watched
-from helpers.fleet_world import ENGINE, FewFrames, Sections
+from helpers.fleet_world import ENGINE, PRIORS, FewFrames, Sections
 
 from vtslam.common.bus import Bus, Member, Steps
 from vtslam.common.bus_memory import MemoryWorld
@@ -68,6 +68,7 @@ class RealtimeResult:
         mapped: Frames in the map, in order.
         sections: Frames of each sealed section.
         ages_s: Age of the pose before, whenever a new one came.
+        ignored: Poses that came with frames and did not count.
         deaths: Of services.
     """
 
@@ -77,6 +78,7 @@ class RealtimeResult:
     mapped: list[int]
     sections: list[list[int]]
     ages_s: list[float]
+    ignored: int
     deaths: list[tuple[str, str]]
 
 
@@ -90,6 +92,7 @@ class RealtimeWorld:
         frames: Frames of the source, at 60 a second.
         seconds: That a working step of a service takes, by name.
         kills: Decides who dies where.
+        priors: Frames that come with a pose.
     """
 
     def __init__(
@@ -101,10 +104,11 @@ class RealtimeWorld:
         frames: int,
         seconds: dict[str, float],
         kills: Kills | None = None,
+        priors: tuple[int, ...] = PRIORS,
     ) -> None:
         self.world = MemoryWorld(schedule, kills=kills)
         self._folder, self._settings, self._seconds = folder, settings, seconds
-        self._source = FewFrames(frames, frames, (32, 24))
+        self._source = FewFrames(frames, frames, (32, 24), priors)
         self._store = MapStore(folder / "map", budget_bytes=1 << 30, pins=24)
         self._ended: set[str] = set()
         self._epochs = dict.fromkeys(_ORDER, 0)
@@ -133,6 +137,7 @@ class RealtimeWorld:
                 float(now_ns * 1e-9 - start_s - before)
                 for (now_ns, _), before in zip(poses[1:], captured, strict=False)
             ],
+            ignored=said["tracker"].counters.get("priors.ignored", 0),
             deaths=self.world.deaths,
         )
 

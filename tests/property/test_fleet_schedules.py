@@ -1,7 +1,7 @@
 """A fleet's services under any order of events and any deaths: the result is always that of one process."""
 
 import pytest
-from helpers.fleet_world import FRAMES, expected, run_world
+from helpers.fleet_world import FRAMES, SETTINGS, FewFrames, Stream, expected, fleet_world, in_one_process, run_world
 
 from vtslam.common.bus_schedule import KillAt, ScriptedSchedule, SeededKills, SeededSchedule
 from vtslam.common.shm.errors import SharedMemoryFull
@@ -48,3 +48,13 @@ def test_any_order_with_any_deaths() -> None:
     for seed in range(_SEEDS):
         result, world = run_world(SeededSchedule(seed), SeededKills(seed, probability=0.03, limit=6))
         assert result == expected(), f"seed {seed}, deaths {world.deaths}"
+
+
+def test_poses_that_come_after_the_first_frame_are_ignored_whoever_dies() -> None:
+    alone, _ = in_one_process(FewFrames(priors=()), SETTINGS)
+    assert in_one_process(FewFrames(priors=(1, 3)), SETTINGS)[0] == alone
+    for seed in range(6):
+        kills = SeededKills(seed, probability=0.03, limit=6)
+        with fleet_world(SeededSchedule(seed), kills, stream=Stream(priors=(1, 3))) as fleet:
+            assert fleet.run() == alone, f"seed {seed}, deaths {fleet.world.deaths}"
+            assert fleet.count("tracker", "priors.ignored") >= 1

@@ -4,7 +4,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from helpers.fleet_world import settings_of
+from helpers.fleet_world import PRIORS, settings_of
 from helpers.realtime_world import RealtimeResult, RealtimeWorld
 
 from vtslam.common import failpoints
@@ -27,10 +27,16 @@ class _OneDeathEach:
         return service in self._kills and self._kills[service].dies(service, point)
 
 
-def realtime_run(seed: int, kills: Kills) -> RealtimeResult:
+def realtime_run(seed: int, kills: Kills, priors: tuple[int, ...] = PRIORS) -> RealtimeResult:
     with tempfile.TemporaryDirectory(dir=shared_memory_folder()) as name, pytest.MonkeyPatch.context() as patch:
         fleet = RealtimeWorld(
-            Path(name), SeededSchedule(seed), settings_of(_SECTION), frames=_FRAMES, seconds=_SECONDS, kills=kills
+            Path(name),
+            SeededSchedule(seed),
+            settings_of(_SECTION),
+            frames=_FRAMES,
+            seconds=_SECONDS,
+            kills=kills,
+            priors=priors,
         )
         patch.setattr(failpoints, "reach", fleet.world.point)
         try:
@@ -60,3 +66,9 @@ def test_frames_are_counted_once_whoever_dies() -> None:
         assert result.published == _FRAMES == result.tracked + result.dropped, f"seed {seed}, {result.deaths}"
         assert result.mapped == [frame_id for section in result.sections for frame_id in section], f"seed {seed}"
     assert deaths > 6
+
+
+def test_poses_that_begin_after_the_first_frame_are_ignored_and_counted() -> None:
+    assert realtime_run(0, NoKills(), tuple(range(_FRAMES))).ignored == 0
+    late = realtime_run(0, NoKills(), tuple(range(1, _FRAMES)))
+    assert late.ignored == late.tracked - 1

@@ -1,5 +1,6 @@
 """Poses from elsewhere: as priors of tracking, and in place of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from vtslam.services.evaluation import evaluate_run
 from vtslam.services.recorded_run import RecordedRun
 from vtslam.services.run_plan import plan_run
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.storage.recording.writer import RecordingWriter
 from vtslam.storage.run_folder import RunFolder
 
 FRAMES = 8
@@ -106,3 +108,44 @@ def test_poses_of_a_bag_are_mapped_at_in_a_fleet(small: SmallRecording, tmp_path
 def test_without_poses_tracking_cannot_be_off(small: SmallRecording) -> None:
     with pytest.raises(ConfigError, match=r"--tracking off: .*expected a pose for the first frame"):
         plan_run(small.files.uri, assignments=["tracker.enabled=false"])
+
+
+def _poses_from(path: Path, poses: Path, first: int) -> Path:
+    """A file of the poses from frame ``first`` on."""
+    path.write_text("".join(poses.read_text().splitlines(keepends=True)[first:]))
+    return path
+
+
+@pytest.mark.parametrize("tracking", ["on", "off"])
+def test_poses_that_begin_after_the_first_frame_are_refused(
+    tracking: str, small: SmallRecording, poses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late, words = str(_poses_from(tmp_path / "late.txt", poses, 5)), ["--tracking", tracking, "--in-process"]
+    for frames, told in (("2:9", "--frames 5:9"), ("0:5", "found none for the first 5"), ("1:", "--frames 5:20")):
+        out = ["--frames", frames, "--out", str(tmp_path / "run")]
+        assert main(["run", small.files.uri, "--poses", late, *words, *out]) == 2
+        error = capsys.readouterr().err
+        assert "expected a pose for the first frame, which says where the world is, found none" in error
+        assert told in error
+    assert not (tmp_path / "run").exists()
+    plan_run(small.files.uri, assignments=["source.frames=5:9", f'source.poses="{late}"'])
+
+
+def test_recorded_poses_that_begin_late_are_ignored_and_told_of(
+    small: SmallRecording, poses: Path, tmp_path: Path
+) -> None:
+    settings = [*ASSIGNMENTS, f"source.frames=0:{FRAMES}"]
+    source = open_source(small.files.uri, frames=(0, FRAMES), overrides={"poses": str(poses)})
+    with RecordingWriter(tmp_path / "x.mcap", family="tum") as recording:
+        for index in range(FRAMES):
+            frame = source.frame(index)
+            recording.add_frame(frame if index > 1 else replace(frame, pose_prior=None))
+    plan = plan_run(f"mcap:{tmp_path / 'x.mcap'}", assignments=settings)
+    plan.execute(tmp_path / "one")
+    plan.execute_in_fleet(tmp_path / "many", Disturbance().hooks())
+    plan_run(small.files.uri, family="tum", assignments=settings).execute(tmp_path / "without")
+    without = result_bytes(tmp_path / "without")
+    for name in ("one", "many"):
+        assert result_bytes(tmp_path / name) == without
+        told = [event.text for event in RunFolder.open(tmp_path / name).catalog.events() if event.kind == "priors"]
+        assert [text.partition(" comes with a pose")[0] for text in told] == ["frame 2"]

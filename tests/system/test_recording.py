@@ -31,7 +31,10 @@ from vtslam.services.run_plan import plan_resume, plan_run
 from vtslam.services.sensor.sources.base import SourceUri
 from vtslam.services.sensor.sources.mcap_recording import open_mcap
 from vtslam.services.sensor.sources.registry import open_source
-from vtslam.storage.errors import WriteFailed
+from vtslam.services.supervisor.fleet_run import FleetHooks
+from vtslam.services.supervisor.live_run import run_live
+from vtslam.storage.errors import RunFolderError, RunLocked, WriteFailed
+from vtslam.storage.run_folder import RunFolder
 
 _NO_CHUNK_BYTES = 100  # of a recording whose writer was killed before the first frame was on disk
 
@@ -65,6 +68,53 @@ def test_frames_and_poses_of_a_run_are_recorded(in_process: bool, small: SmallRe
     with pytest.raises(WriteFailed, match="--overwrite"):
         plan.execute(tmp_path / "again")
     assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize("start", ["in_process", "in_fleet", "live"])
+def test_a_run_that_is_refused_takes_no_recording_away(start: str, small: SmallRecording, tmp_path: Path) -> None:
+    path, busy, foreign = tmp_path / "x.mcap", tmp_path / "busy", tmp_path / "foreign"
+    path.write_bytes(b"kept")
+    foreign.mkdir()
+    (foreign / "thesis.txt").write_text("mine")
+    plan, hooks, setting = small_plan(small.files, f'recorder.file="{path}"'), FleetHooks(), f'recorder.file="{path}"'
+    run: dict[str, Callable[[Path], object]] = {
+        "in_process": lambda out: plan.execute(out, overwrite=True),
+        "in_fleet": lambda out: plan.execute_in_fleet(out, hooks, overwrite=True),
+        "live": lambda out: run_live(
+            out, hooks, fleet="test", preset="fast", family="tum", assignments=[setting], overwrite=True
+        ),
+    }
+    with RunFolder.create(busy, plan.info()), pytest.raises(RunLocked):
+        run[start](busy)
+    with pytest.raises(RunFolderError, match="not empty and not a run folder"):
+        run[start](foreign)
+    assert path.read_bytes() == b"kept"
+
+
+def test_a_recording_does_not_take_the_place_of_its_source(
+    small: SmallRecording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "k.mcap"
+    small_plan(small.files, f'recorder.file="{path}"', "source.frames=0:2").execute(tmp_path / "run")
+    whole = path.read_bytes()
+    for record in (path, tmp_path / "."):
+        words = ["--record", str(record), "--overwrite", "--in-process", "--out", str(tmp_path / "again")]
+        assert main(["run", f"mcap:{path}", *words]) == 1
+    told = capsys.readouterr().err
+    assert "k.mcap: expected a file that nobody uses, found one that is read or written meanwhile" in told
+    assert "expected a file to record in, found no regular file" in told
+    assert path.read_bytes() == whole
+    assert not (tmp_path / "again").exists()
+
+
+def test_an_earlier_recording_is_given_up_with_all_its_parts(small: SmallRecording, tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    for part in (path, tmp_path / "x-2.mcap"):
+        part.write_bytes(b"of an earlier run")
+    plan = small_plan(small.files, f'recorder.file="{path}"', "source.frames=0:2")
+    plan.execute(tmp_path / "run", overwrite=True)
+    assert [each.name for each in tmp_path.glob("*.mcap")] == ["x.mcap"]
+    assert len(open_source(f"mcap:{path}")) == 2
 
 
 def test_a_recorder_that_dies_goes_on_in_another_part(small: SmallRecording, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sqlite3
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -33,6 +34,7 @@ from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.process_facts import children_of
 from vtslam.services.run_plan import plan_resume
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.storage import section_care
 from vtslam.storage.errors import ChecksumMismatch, RunFolderError, RunLocked, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
 
@@ -104,6 +106,8 @@ def test_a_fleet_killed_as_a_whole_goes_on_twice(small: SmallRecording, tmp_path
         (["run", "sim:room"], "run: expected SOURCE and --out RUN, or --resume RUN"),
         (["run", "sim:room", "--resume", "RUN"], "goes on with the run's own source and settings"),
         (["run", "--resume", "RUN", "--holdout", "3"], "goes on with the run's own source and settings"),
+        (["run", "--resume", "RUN", "--preset", "fast"], "goes on with the run's own source and settings"),
+        (["run", "--resume", "RUN", "--family", "kitti"], "goes on with the run's own source and settings"),
         (["run", "--resume", "RUN", "--record", "x.mcap"], "a run that records goes on recording"),
     ],
 )
@@ -212,6 +216,68 @@ def test_another_recording_in_its_place_is_refused(small: SmallRecording, tmp_pa
             plan_resume(run).resume(run)
     finally:
         path.write_bytes(whole)
+
+
+def _stopped_after(frames: int, small: SmallRecording, run: Path) -> None:
+    """A run that was asked to stop there; its last section is kept as far as it came."""
+    seen: list[int] = []
+    small_plan(small.files).execute(
+        run, on_frame=lambda facts: seen.append(facts.frame_id), should_stop=lambda: len(seen) >= frames
+    )
+
+
+@pytest.mark.parametrize("harm", ["another frame", "no frame", "nothing to go on from"])
+def test_a_resumption_that_is_refused_takes_nothing_away(harm: str, small: SmallRecording, tmp_path: Path) -> None:
+    run, path = tmp_path / "run", small.files.color_path(SECTION - 1)
+    _stopped_after(SECTION + 2, small, run)  # the second section would be dropped, and mapped again
+    (run / "metrics.json").write_text("{}")
+    kept, whole = result_bytes(run), path.read_bytes()
+    assert len(kept) == 3
+    try:
+        if harm == "another frame":
+            path.write_bytes(small.files.color_path(0).read_bytes())
+        elif harm == "no frame":
+            cut_in_half(path)
+        else:
+            with sqlite3.connect(run / "catalog.sqlite") as catalog:
+                catalog.execute("UPDATE sections SET resume = NULL")
+            catalog.close()
+        with pytest.raises((RunFolderError, SourceError)):
+            plan_resume(run).resume(run)
+    finally:
+        path.write_bytes(whole)
+    assert result_bytes(run) == kept
+    assert RunFolder.open(run).catalog.num_frames == SECTION + 2
+    assert (run / "metrics.json").exists()
+
+
+def test_a_run_goes_on_from_what_it_mapped_only(
+    small: SmallRecording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    _stopped_after(SECTION, small, run)
+    kept = result_bytes(run)
+    assert main(["sections", "repack", str(run)]) == 1
+    assert "--codec dense rounds: expected a finished run, found one that may go on; finish it first (vtslam run " in (
+        capsys.readouterr().err
+    )
+    assert result_bytes(run) == kept
+    assert main(["sections", "repack", str(run), "--codec", "raw"]) == 0
+    with RunFolder.open(run, writable=True) as folder:
+        section_care.repack(folder, 0, codec="dense")
+    with pytest.raises(RunFolderError, match=r"000000\.vts: expected what was mapped, .*rounded by the codec dense"):
+        plan_resume(run).resume(run)
+    assert RunFolder.open(run).catalog.num_frames == SECTION
+
+
+def test_a_finished_run_may_be_rounded_and_is_left_so(small: SmallRecording, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    small_plan(small.files).execute(run)
+    assert main(["sections", "repack", str(run)]) == 0
+    packed = result_bytes(run)
+    plan_resume(run).resume(run)
+    assert {row.codec for row in RunFolder.open(run).catalog.sections()} == {"dense"}
+    assert result_bytes(run) == packed
 
 
 def test_two_fleets_on_one_run_folder_are_refused(small: SmallRecording, tmp_path: Path) -> None:

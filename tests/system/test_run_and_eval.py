@@ -2,6 +2,11 @@
 
 import json
 import os
+import shutil
+import sqlite3
+from collections.abc import Iterable
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +18,12 @@ from vtslam.common import metrics
 from vtslam.common.trajectory_io import read_trajectory
 from vtslam.services.cli.__main__ import main
 from vtslam.services.evaluation import evaluate_run
+from vtslam.services.film import write_film
 from vtslam.services.recorded_run import RecordedRun
+from vtslam.services.run_view import show_run
+from vtslam.services.viewer.parts import Part
+from vtslam.storage.catalog import Catalog
+from vtslam.storage.errors import RunFolderError
 from vtslam.storage.run_folder import RunFolder
 
 FRAMES, LENGTH, HOLDOUT = 12, 5, 2
@@ -145,6 +155,77 @@ def test_seams_are_seen_from_the_section_that_ends(room_run: Path) -> None:
     values = evaluate_run(run)
     assert values["psnr_next_db"] == pytest.approx(np.mean(next_db))
     assert values["psnr_last_db"] == pytest.approx(np.mean(last_db))
+
+
+class _Sink:
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+
+    def send(self, frame_id: int, update: Iterable[Part]) -> bool:
+        self.frames += [frame_id] if not self.frames or self.frames[-1] != frame_id else []
+        return True
+
+
+@pytest.mark.parametrize("state", ["cut off", "set aside"])
+def test_sections_that_do_not_count_are_not_looked_at(state: str, room_run: Path, tmp_path: Path) -> None:
+    path, frames = shutil.copytree(room_run, tmp_path / "run"), list(range(10))
+    with RunFolder.open(path, writable=True) as run:
+        if state == "set aside":
+            run.catalog.set_missing(1)
+            run.section_path(1).unlink()
+            frames = [*range(5), 10, 11]
+        else:  # the last section's file is there, and not in the catalogue
+            run.catalog.drop_from(2)
+    recorded = RecordedRun(path)
+    values, sink = evaluate_run(recorded), _Sink()
+    assert values["sections"] == len(recorded.section_ids()) == 2
+    assert [frame["frame"] for frame in values["per_frame"]] == [each for each in (0, 5, 10) if each in frames]  # type: ignore[attr-defined]
+    show_run(recorded, sink, section_gaussians=100, gaussians=1000)
+    assert sink.frames == frames
+    write_film(tmp_path / "film.gif", recorded)
+    assert recorded.frames_in_sections() == frames
+
+
+def test_a_run_without_a_finished_section_cannot_be_filmed(room_run: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(room_run, tmp_path / "run")
+    with RunFolder.open(path, writable=True) as run:
+        for section_id in range(3):
+            run.catalog.set_missing(section_id)
+    with pytest.raises(RunFolderError, match="expected a finished section to film, found none"):
+        write_film(tmp_path / "film.gif", RecordedRun(path))
+
+
+@pytest.mark.parametrize("command", [["eval"], ["view", "--film", "film.gif"]])
+def test_runs_that_cannot_be_judged_say_why(
+    command: list[str], room_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fed, realtime = (shutil.copytree(room_run, tmp_path / name) for name in ("fed", "realtime"))
+    with RunFolder.open(fed, writable=True) as run:
+        info = run.read_info()
+        run.write_info(replace(info, facts=replace(info.facts, source="live:")))
+    assert main([*command, str(fed)]) == 1
+    told = capsys.readouterr().err
+    assert "publishers fed this run, and their frames, which its map is held against, are gone; record the next" in told
+    with closing(sqlite3.connect(realtime / "catalog.sqlite")) as catalog, catalog:
+        catalog.execute("DELETE FROM quality WHERE frame_id = 3")
+        catalog.execute("DELETE FROM frames WHERE frame_id = 3")
+    assert main([*command, str(realtime)]) == 1
+    assert (
+        "expected every frame up to frame 11, found 11 of 12: a run that leaves frames out, as --pacing realtime"
+        in (capsys.readouterr().err)
+    )
+
+
+def test_what_to_do_next_is_said_if_it_can_be_done(
+    room_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = shutil.copytree(room_run, tmp_path / "run")
+    words = ["run", "--resume", str(path), "--in-process"]
+    assert main(words) == 0
+    assert f"(next: vtslam eval {path})" in capsys.readouterr().out
+    monkeypatch.setattr(Catalog, "last_frame_id", FRAMES)  # one was left out
+    assert main(words) == 0
+    assert "next:" not in capsys.readouterr().out
 
 
 def test_an_existing_run_is_kept_unless_overwriting_is_asked_for(

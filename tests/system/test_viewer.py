@@ -156,6 +156,10 @@ def test_refusals_say_what_to_do(
         (["view", run, "--film", str(tmp_path / "x.mp4")], 1, "expected a name that ends in .webp or .gif"),
         (["view", run, "--web", "--port", "70000"], 2, "expected 1 to 65534"),
         (["view", "--live", "--film", "x.webp"], 2, "expected a finished RUN"),
+        (["view", run, "--fleet", "x"], 2, f"--fleet x: expected --live beside it, found the run {run}"),
+        (["view", run, "--save", "x.rrd", "--port", "7"], 2, "--port 7: expected --web beside it, found none"),
+        (["view", run, "--film", "x.gif", "--web"], 2, "--film x.gif: expected alone, found --web beside it"),
+        (["view", run, "--film", "x.gif", "--save", "x.rrd"], 2, "expected alone, found --save beside it"),
         (["view", "--live", "--fleet", "none-of-that-name"], 1, "expected the folder of a fleet, found nothing"),
     ):
         assert main(words) == status, words

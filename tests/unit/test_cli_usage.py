@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.processes import source_environment
 
+from vtslam.services.cli import doctor_gpu
 from vtslam.services.cli.__main__ import main
 
 COMMANDS = ("demo", "run", "up", "publish", "status", "eval", "settings", "doctor")
@@ -60,6 +61,7 @@ RUN = ("run", "sim:room", "--size", "48x36", "--frames", "0:2", "--out", "out/ru
         (("run", "film:x", "--in-process", "--out", "out"), 1, "found 'film:x'"),
         (("run", "replica:nowhere", "--in-process", "--out", "out"), 1, "expected a folder of a recording"),
         (("eval", "nowhere"), 1, "not a run folder"),
+        (("doctor", "sim:room", "--gpu"), 2, "expected a recording to look at or --gpu, found sim:room and --gpu"),
         (("settings", "--set", "seed=x"), 2, "expected an integer"),
     ],
 )
@@ -97,3 +99,19 @@ def test_doctor_is_content_here_and_says_so(capsys: pytest.CaptureFixture[str]) 
 
     assert findings["portable"]["found"].startswith("renders the known numbers")
     assert all(finding["ok"] for finding in findings.values())
+
+
+@pytest.mark.parametrize("status", [0, 1, 2])
+def test_doctor_says_of_the_gpu_what_it_found(
+    status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor_gpu, "run_gpu_doctor", lambda out: status)
+    assert main(["doctor", "--gpu", "--json", "-"]) == status
+    assert json.loads(capsys.readouterr().out) == {"ok": status == 0, "status": status}
+
+
+def test_tracking_on_the_command_line_counts_more_than_in_a_file(tmp_path: Path) -> None:
+    (tmp_path / "off.toml").write_text("tracker.enabled = false\n")
+    words = [*RUN[:-2], "--in-process", "--config", str(tmp_path / "off.toml")]
+    assert main([*words, "--tracking", "on", "--out", str(tmp_path / "run")]) == 0
+    assert main([*words, "--out", str(tmp_path / "none")]) == 2

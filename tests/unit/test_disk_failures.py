@@ -12,7 +12,7 @@ import pytest
 from helpers.small_runs import check_whole, result_bytes, small_run, write_sections
 
 from vtslam.storage import atomic
-from vtslam.storage.errors import DiskFull, WriteFailed
+from vtslam.storage.errors import CatalogError, DiskFull, WriteFailed
 from vtslam.storage.run_folder import RunFolder
 
 
@@ -115,6 +115,19 @@ def test_a_read_only_disk_can_be_read_and_refuses_writers(small_disk: Path) -> N
         assert run.catalog.num_frames == 6
         assert run.read_section(1).section_id == 1
     assert "cannot write: Read-only file system" in refusal(lambda: RunFolder.open(path, writable=True))
+
+
+def test_a_read_only_disk_with_transactions_in_a_log_is_refused(small_disk: Path, folder_in_memory: Path) -> None:
+    path = small_run(small_disk / "run", 1)
+    with RunFolder.open(path, writable=True) as run:
+        write_sections(run, 1, 2)
+        for file in path.glob("catalog.sqlite*"):  # as they are if the writer dies now
+            shutil.copyfile(file, folder_in_memory / file.name)
+    for name in ("catalog.sqlite", "catalog.sqlite-wal"):
+        shutil.copyfile(folder_in_memory / name, path / name)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with pytest.raises(CatalogError, match=r"catalog\.sqlite-wal: expected a catalogue that was closed, found trans"):
+        _ = RunFolder.open(path).catalog
 
 
 def grow(path: Path) -> None:

@@ -1,6 +1,7 @@
 """The journal of committed frames: whole lines, in order, section by section."""
 
 import errno
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -142,3 +143,11 @@ def test_lines_are_deleted_once_they_are_durable_and_counted(tmp_path: Path) -> 
     progress.step()
     assert seen == [0, 1, 2, 3, 4]
     catalog.close()
+
+
+def test_facts_come_back_exactly_also_those_of_an_earlier_version() -> None:
+    facts = replace(facts_of(4), history=TrackerHistory(largest_mean_depths_m=(0.1 + 0.2,), ignores_priors=True))
+    assert CommitFacts.unpacked(facts.packed()).history == facts.history
+    plain = json.loads(facts.packed())
+    del plain["history"]["ignores_priors"]
+    assert CommitFacts.unpacked(json.dumps(plain).encode()).history == replace(facts.history, ignores_priors=False)

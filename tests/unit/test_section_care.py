@@ -14,8 +14,9 @@ from vtslam.storage.atomic import rename_file
 from vtslam.storage.dense_section import DenseGrid
 from vtslam.storage.errors import ChecksumMismatch, UnreadableFile
 from vtslam.storage.run_folder import RunFolder
-from vtslam.storage.section_codecs import SectionCodec
-from vtslam.storage.section_file import write_section
+from vtslam.storage.section_codecs import SectionCodec, codec_of_header
+from vtslam.storage.section_facts import file_facts
+from vtslam.storage.section_file import read_columns, write_section
 from vtslam.storage.section_record import SectionRecord
 
 
@@ -148,7 +149,16 @@ def test_repacking_that_is_cut_off_leaves_one_whole_file(
         with pytest.raises(_CutOff):
             section_care.repack(run, 1, codec="raw", write=write)
         monkeypatch.undo()
+        row = run.catalog.section(1)
+        assert row is not None
+        if file_facts(run.section_path(1)).sha256 != row.sha256:
+            with pytest.raises(ChecksumMismatch, match=rf"\(vtslam sections repair {path} brings it in order\)$"):
+                section_care.require_intact(run, row)
         section_care.repair(run)
+        row = run.catalog.section(1)
+        assert row is not None
+        assert row.codec == codec_of_header(read_columns(run.section_path(1), [])[0])
+        section_care.require_intact(run, row)
         assert list((path / "sections").glob(".*")) == []
     assert check_whole(path, at_least=4) == 4
 

@@ -184,6 +184,7 @@ def test_refusals(recording: KittiRecording, damage: str) -> None:
         ("depth=radar", "kitti: option depth: expected one of stereo, lidar; found 'radar'"),
         ("images=color", "image_2: expected a folder"),
         ("densify=-1", "kitti: option densify: expected pixels from 0 to 50; found '-1'"),
+        ("densify=5", "kitti: option densify: expected beside depth=lidar, found depth=stereo"),
         ("scale=2", "kitti: expected options among"),
     ],
 )

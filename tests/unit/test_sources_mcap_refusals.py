@@ -6,13 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
 from helpers.mcap_bytes import BagWriter, frames, record, write_recording
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
 
 from vtslam.common.geometry.camera import Camera
 from vtslam.services.sensor.sources.base import SourceError
+from vtslam.services.sensor.sources.mcap_poses import TransformPoses
 from vtslam.services.sensor.sources.registry import open_source
+from vtslam.storage.errors import MalformedRecording
+from vtslam.storage.recording.mcap_file import McapFile
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER = MAGIC + record(1, bytes(8))
@@ -62,6 +72,10 @@ ONE = message(1, b"x")
         (
             HEADER + chunk(ONE) + record(_INDEX, struct.pack("<HIQQ", 1, 16, 0, 9999)) + record(_END, bytes(4)),
             "expected messages within their chunk, found one at 9999",
+        ),
+        (
+            HEADER + chunk(ONE) + record(_INDEX, struct.pack("<HIQQ", 1, 16, 2**63, 0)) + record(_END, bytes(4)),
+            "expected a time of less than 2\\*\\*63 ns, found a log time of 9223372036854775808 ns",
         ),
         (HEADER + chunk(ONE) + record(_INDEX, b"\1\0\xff\xff\0\0") + record(_END, b""), "message ?index record, found"),
     ],
@@ -126,11 +140,46 @@ def test_odd_images_are_refused_when_read(change: Callable[[BagWriter], None], t
         source.frame(0)
 
 
+@pytest.mark.parametrize("stamp", [(-1, 0), (5, 10**9)])
+def test_stamps_that_are_no_times_are_refused(stamp: tuple[int, int], tmp_path: Path) -> None:
+    bag, frame = BagWriter(use_chunking=False), frames(1)[0]  # without a checksum
+    bag.add_frame(frame)
+    path = bag.write(tmp_path / "bag.mcap")
+    sound = struct.pack("<iI", frame.capture_time_ns // 10**9, frame.capture_time_ns % 10**9)
+    path.write_bytes(path.read_bytes().replace(sound, struct.pack("<iI", *stamp)))
+    with pytest.raises(SourceError, match=r"/camera/color/image_raw: expected a time stamp, found a time of "):
+        open_source(f"mcap:{path}")
+
+
+def _foxglove(path: Path, messages: dict[str, Message]) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("", library="test")
+        for topic, content in messages.items():
+            channel = writer.register_channel(topic, MessageEncoding.Protobuf, register_schema(writer, type(content)))
+            writer.add_message(channel, 1, content.SerializeToString(), 1)
+        writer.finish()
+    return path
+
+
+def test_stamps_of_more_than_63_bits_are_refused(tmp_path: Path) -> None:
+    late, text = Timestamp(seconds=2**40, nanos=0), "a time of 1099511627776 s and 0 ns"
+    image, transform = RawImage(timestamp=late), FrameTransform(timestamp=late, child_frame_id="camera")
+    transform.rotation.w = 1.0
+    images = _foxglove(tmp_path / "images.mcap", {"/image": image, "/depth": image})
+    with pytest.raises(SourceError, match=text):
+        open_source(f"mcap:{images}")
+    transforms = McapFile(_foxglove(tmp_path / "transforms.mcap", {"/tf": transform}))
+    with pytest.raises(MalformedRecording, match=text):
+        TransformPoses(transforms, "/tf", "camera", None)
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
         ({"tolerance_ms": "-1"}, "option tolerance_ms: expected a positive number, found '-1'"),
         ({"stamp": "wall"}, "option stamp: expected one of header, log, found 'wall'"),
+        ({"distortion": "maybe"}, "option distortion: expected one of refuse, ignore, found 'maybe'"),
         ({"camera": "/x"}, "option camera: expected a topic with intrinsics /camera/color/camera_info, found '/x'"),
         ({"gamma": "1"}, "expected options among .*; found 'gamma'"),
     ],
@@ -139,6 +188,14 @@ def test_odd_options_are_refused(options: dict[str, str], text: str, tmp_path: P
     path = _bag(lambda bag: None).write(tmp_path / "bag.mcap")
     with pytest.raises(SourceError, match=text):
         open_source(f"mcap:{path}", overrides=options)
+
+
+@pytest.mark.parametrize("option", ["depth_scale=500", "tolerance_ms=3", "stamp=log"])
+def test_options_that_this_program_records_are_refused_of_its_recordings(option: str, tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "x.mcap", frames(2))
+    name = option.partition("=")[0]
+    with pytest.raises(SourceError, match=f"x.mcap: option {name}: expected for recordings of others, found one of"):
+        open_source(f"mcap:{path}?{option}")
 
 
 def test_bags_without_intrinsics_or_with_odd_ones_are_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from mcap.writer import CompressionType
 
 from vtslam.common.frame import Frame
 from vtslam.common.geometry import se3
+from vtslam.common.geometry.camera import Camera
 from vtslam.services.sensor.sources.base import Source, SourceError
 from vtslam.services.sensor.sources.registry import open_source
 
@@ -162,6 +163,47 @@ def test_distorted_images_are_refused_unless_accepted(recorded: list[Frame], tmp
     with pytest.raises(SourceError, match=r"without lens distortion, found coefficients \[0.1, -0.2"):
         opened(path)
     assert_plays(opened(path, distortion="ignore"), [frame])
+
+
+RECTIFIED = replace(CAMERA, fx=38.0, cx=23.0)
+DISTORTED = (0.1, -0.2, 0.0, 0.0, 0.0)
+
+
+def colour_bag(name: str, frame: Frame, distortion: tuple[float, ...], rectified: Camera) -> BagWriter:
+    bag, (_, packed) = BagWriter(), cv2.imencode(".png", frame.rgb[..., ::-1])
+    bag.add_calibration("/camera/color/camera_info", CAMERA, 0, distortion=distortion, rectified=rectified)
+    if name.endswith("compressed"):
+        bag.add_compressed(name, packed.tobytes(), "rgb8; png compressed bgr8", frame.capture_time_ns)
+    else:
+        bag.add_image(name, frame.rgb, "rgb8", frame.capture_time_ns)
+    bag.add_image("/camera/depth/image", frame.depth, "16UC1", frame.capture_time_ns)
+    return bag
+
+
+@pytest.mark.parametrize("options", [{}, {"distortion": "ignore"}, {"distortion": "refuse"}])
+@pytest.mark.parametrize("distortion", [DISTORTED, (0.0,) * 5])
+@pytest.mark.parametrize("last", ["image_rect", "image_rect_color", "rectified", "image_rect/compressed"])
+def test_rectified_images_have_the_intrinsics_of_p(
+    last: str, distortion: tuple[float, ...], options: dict[str, str], recorded: list[Frame], tmp_path: Path
+) -> None:
+    path = colour_bag(f"/camera/color/{last}", recorded[0], distortion, RECTIFIED).write(tmp_path / "bag.mcap")
+    assert_plays(opened(path, **options), [replace(recorded[0], camera=RECTIFIED)])
+
+
+def test_others_have_those_of_k(recorded: list[Frame], tmp_path: Path) -> None:
+    path = colour_bag("/rect/direct_image", recorded[0], (0.0,) * 5, RECTIFIED).write(tmp_path / "bag.mcap")
+    assert_plays(opened(path), [recorded[0]])
+
+
+def test_rectified_images_without_p_are_refused_unless_k_is_accepted(recorded: list[Frame], tmp_path: Path) -> None:
+    nothing = replace(CAMERA, cx=0.5, cy=0.5)
+    for field in ("fx", "fy"):
+        object.__setattr__(nothing, field, 0.0)
+    bag = colour_bag("/camera/color/image_rect", recorded[0], DISTORTED, nothing)
+    bag_path = bag.write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match=r"expected the matrix P of rectified images, found coefficients \[0.1"):
+        opened(bag_path)
+    assert_plays(opened(bag_path, distortion="ignore"), [recorded[0]])
 
 
 def test_transforms_give_poses(recorded: list[Frame], tmp_path: Path) -> None:

@@ -3,13 +3,16 @@
 import copy
 import re
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from helpers.recordings import Recording, cut_in_half, pose_row, write_png, write_replica, write_seven_scenes
+from helpers.recordings import Recording, cut_in_half, images, pose_row, write_png, write_replica, write_seven_scenes
 
+from vtslam.services.sensor.sources import image_files
 from vtslam.services.sensor.sources.base import Source, SourceError
 from vtslam.services.sensor.sources.registry import open_source
 
@@ -293,3 +296,34 @@ def test_same_bytes_from_another_working_directory(
     for index in range(2):
         np.testing.assert_array_equal(again.frame(index).rgb, source.frame(index).rgb)
         np.testing.assert_array_equal(again.frame(index).depth, source.frame(index).depth)
+
+
+def _claiming(jpeg: bytes, width: int, height: int) -> bytes:
+    """The JPEG file with another size in its frame header."""
+    at = max(jpeg.find(b"\xff\xc0"), jpeg.find(b"\xff\xc2"))
+    return jpeg[: at + 5] + struct.pack(">HH", height, width) + jpeg[at + 9 :]
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+@pytest.mark.parametrize(
+    "before", [b"", b"\xff\xff", b"\xff\xe1\x00\x08\xff\xc0\x00\x11\x08\x00", b"\xff\xfe\x00\x04hm"]
+)
+def test_images_of_another_size_are_not_unpacked(
+    before: bytes, progressive: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rgb = images(1, width=48, height=36)[0][0]
+    flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive, cv2.IMWRITE_JPEG_QUALITY, 98]
+    plain = cv2.imencode(".jpg", rgb[..., ::-1], flags)[1].tobytes()
+    jpeg = plain[:2] + before + plain[2:]
+    assert image_files.decoded_color(jpeg, "x", (48, 36)).shape == (36, 48, 3)
+    monkeypatch.setattr(image_files, "_decode", lambda *args: pytest.fail("it was unpacked"))
+    large = plain[:2] + before + _claiming(plain, 9000, 9001)[2:]
+    told = refusal(lambda: image_files.decoded_color(large, "x", (48, 36)))
+    assert told == "x: expected an image of 48x36, found 9000x9001"
+
+
+@pytest.mark.parametrize("rest", [b"", b"\xff\xe0\x00\x02", b"\xff\xe0\xff\xff", b"\xff\xda\x00\x02", b"\xff\xc0\x00"])
+def test_jpeg_files_without_a_frame_header_are_refused(rest: bytes) -> None:
+    data = b"\xff\xd8" + rest + b"\xff\xd9"
+    told = refusal(lambda: image_files.decoded_color(data, "x", (48, 36)))
+    assert told == "x: expected a JPEG file with a frame header, found none before its data"

@@ -198,7 +198,7 @@ def test_empty_folders(recording: ScanNetRecording) -> None:
         ({"num_frames": 0}, "expected frames, found none"),
         ({"num_frames": 4}, "expected 96 bytes of frame 3 of 4, found the file cut after 0 of them"),
         ({"num_frames": 2**60}, "expected 96 bytes of frame 3 of .*, found the file cut after 0 of them"),
-        ({"sizes": (32, 24, 32, 24)}, "frame 0: colour: expected 32x24, found 64x48"),
+        ({"sizes": (32, 24, 32, 24)}, "frame 0: colour: expected an image of 32x24, found 64x48"),
         ({"sizes": (64, 48, 32, 48)}, "frame 0: depth: expected 3072 bytes for 32x48, found 1536"),
         ({"sizes": (64, 48, 32, 12)}, "frame 0: depth: expected 768 bytes for 32x12, found 769"),
     ],

@@ -240,6 +240,17 @@ def test_a_prior_places_the_first_frame_and_steers_the_others() -> None:
         assert pose_error(found, true)[0] < 1e-3
 
 
+def test_later_priors_count_if_the_first_pose_is_known() -> None:
+    lift = se3.exp(np.array([3.0, -2.0, 1.0, 0.3, 0.2, 0.5]))
+    frames, truth, covariance = room_frames()[:3], lift @ true_poses(), 1e-10 * np.eye(6)
+    system = System(settings_of(), NativeEngine(threads=1), MemoryArchive(), threads=1)
+    system.process(frames[0], known_T_world_camera=truth[0])
+    for frame, true in zip(frames[1:], truth[1:], strict=False):
+        prior = ExternalPose(T_world_camera=true, covariance=covariance)
+        found = system.process(replace(frame, pose_prior=prior)).commit.T_world_camera
+        assert pose_error(found, true)[0] < 1e-6
+
+
 def test_every_schedule_runs() -> None:
     for preset in ("realtime", "released", "paper"):
         adam = [f"tracker.adam.{key}=3" for key in ("iterations", "first_section_iterations", "pretrack_iterations")]

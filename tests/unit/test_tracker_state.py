@@ -1,8 +1,11 @@
 """What the tracker carries from frame to frame."""
 
+from dataclasses import replace
+
 import numpy as np
 from helpers.smooth_room import SmoothRoom, small_camera
 
+from vtslam.common.external_pose import ExternalPose
 from vtslam.common.geometry import se3
 from vtslam.common.tracking_facts import TrackingQuality, TrackingState
 from vtslam.services.tracker.state import TrackerState, TrackResult
@@ -61,3 +64,13 @@ def test_the_next_state_is_a_new_one() -> None:
     assert len(state.committed_poses) == 1
     assert state.largest_mean_depths_m == (2.0,)
     assert state.previous_frame is FRAME
+
+
+def test_priors_count_if_the_first_frame_has_one_also_after_a_restart() -> None:
+    given = replace(FRAME, pose_prior=ExternalPose(T_world_camera=START, covariance=np.eye(6)))
+    for first, counts in ((FRAME, False), (given, True)):
+        state = TrackerState().after(first, START, None, 2.0).after(given, START, result(TrackingState.OK), 2.0)
+        again = TrackerState.resumed(state.committed_poses, given, state.history(), state.exposure)
+        for each in (state, again, again.after(FRAME, START, None, 2.0)):
+            assert (each.prior_of(given) is not None) == counts
+    assert TrackerState().prior_of(given) is given.pose_prior

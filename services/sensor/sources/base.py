@@ -1,5 +1,6 @@
 """The protocol of all sources, their errors, and the URI that names one."""
 
+import os
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 from urllib.parse import parse_qsl, urlencode
@@ -139,6 +140,10 @@ class SourceUri:
         except ValueError as error:
             raise SourceError(f"options of a source read ?key=value&key=value; got {query!r}") from error
         return cls(scheme=scheme, path=path, options=options)
+
+    def files(self) -> list[str]:
+        """What the path and the options may name on disk."""
+        return [os.path.expanduser(text) for text in (self.path, *self.options.values()) if text]
 
     def __str__(self) -> str:
         """The text that :meth:`parse` reads back."""

@@ -20,6 +20,9 @@ from vtslam.services.sensor.sources.base import SourceError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_JPEG_FRAMES = (*range(0xC0, 0xC4), *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))  # SOF markers
+_JPEG_ALONE = (0x00, 0x01, *range(0xD0, 0xD8))  # without a segment
+_JPEG_LAST = (0xD9, 0xDA)  # end of the image, start of its data
 _FRAMES_PER_SECOND = 30  # of recordings without time stamps
 
 
@@ -138,7 +141,7 @@ def decoded_color(data: bytes, where: Path | str, size: tuple[int, int] | None =
     Args:
         data: The bytes.
         where: The file, or another place, for messages.
-        size: Width and height that it must have; unpacking a PNG file of another size is not even tried.
+        size: Width and height that it must have; unpacking a file that claims another size is not even tried.
 
     Raises:
         SourceError: The bytes are cut, damaged, of another kind or size.
@@ -152,6 +155,8 @@ def decoded_color(data: bytes, where: Path | str, size: tuple[int, int] | None =
             raise SourceError(
                 f"{where}: expected a whole JPEG file, found it cut after {len(data)} bytes (no end mark)"
             )
+        if size is not None:
+            _check_claimed(where, _jpeg_size(where, data), size)
     else:
         raise SourceError(f"{where}: expected a PNG or JPEG file, found {_head(data)}")
     bgr = _decode(where, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -224,8 +229,31 @@ def _check_png(path: Path | str, data: bytes, size: tuple[int, int] | None) -> N
         if at == len(_PNG_SIGNATURE) and (kind != b"IHDR" or length != 13):
             raise SourceError(f"{path}: expected a PNG header, found chunk {kind!r} of {length} bytes")
         at = end
-    found: tuple[int, int] = struct.unpack_from(">II", data, 16)
-    if size is not None and found != size:
+    if size is not None:
+        _check_claimed(path, struct.unpack_from(">II", data, 16), size)
+
+
+def _jpeg_size(path: Path | str, data: bytes) -> tuple[int, int]:
+    """Width and height by the frame header; segments before it are passed over as decoders do."""
+    at = len(_JPEG_START) - 1
+    while (at := data.find(b"\xff", at)) >= 0:
+        while data[at : at + 1] == b"\xff":
+            at += 1
+        marker, at = data[at] if at < len(data) else -1, at + 1
+        if marker in _JPEG_ALONE:
+            continue
+        if marker in _JPEG_FRAMES and at + 7 <= len(data):
+            height, width = struct.unpack_from(">HH", data, at + 3)
+            return width, height
+        if marker in _JPEG_LAST or at + 2 > len(data):
+            break
+        at += max(int.from_bytes(data[at : at + 2], "big"), 2)
+    raise SourceError(f"{path}: expected a JPEG file with a frame header, found none before its data")
+
+
+def _check_claimed(path: Path | str, found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Refuse an image of another width and height by its header, before memory is taken for its pixels."""
+    if found != size:
         raise SourceError(f"{path}: expected an image of {size[0]}x{size[1]}, found {found[0]}x{found[1]}")
 
 

@@ -180,7 +180,7 @@ def open_kitti(uri: SourceUri) -> KittiSource:
         else np.arange(len(left), dtype=np.int64) * _FRAME_PERIOD_NS,
         poses=_poses(folder, len(left), rig),
         depth=depth,
-        densify_px=_densify(uri),
+        densify_px=_densify(uri, depth),
         rig=rig,
     )
 
@@ -192,10 +192,12 @@ def _choice(uri: SourceUri, key: str, choices: tuple[str, ...], default: str) ->
     return value
 
 
-def _densify(uri: SourceUri) -> int:
+def _densify(uri: SourceUri, depth: str) -> int:
     text = uri.options.get("densify", "0")
     if not text.isdecimal() or int(text) > _MAX_DENSIFY_PX:
         raise SourceError(f"kitti: option densify: expected pixels from 0 to {_MAX_DENSIFY_PX}; found {text!r}")
+    if int(text) > 0 and depth != "lidar":
+        raise SourceError(f"kitti: option densify: expected beside depth=lidar, found depth={depth}")
     return int(text)
 
 

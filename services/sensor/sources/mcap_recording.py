@@ -145,6 +145,8 @@ def open_mcap(uri: SourceUri) -> McapRecording:
         depth = mcap_topics.chosen_topic(file, "depth", uri.options.get("depth"))
         facts = depth.channel.metadata
         is_own = topics.DEPTH_SCALE_KEY in facts
+        if is_own:
+            _refuse_options_of_others(uri, path)
         by_log_time = is_own or _choice(uri, "stamp", ("header", "log")) == "log"
         color_ns = mcap_topics.image_times_ns(file, color, by_log_time=by_log_time)
         depth_ns = mcap_topics.image_times_ns(file, depth, by_log_time=by_log_time)
@@ -167,6 +169,13 @@ def open_mcap(uri: SourceUri) -> McapRecording:
         )
 
 
+def _refuse_options_of_others(uri: SourceUri, path: Path) -> None:
+    """Refuse options that say what a recording of this program says itself."""
+    given = [key for key in ("depth_scale", "tolerance_ms", "stamp") if key in uri.options]
+    if given:
+        raise SourceError(f"{path}: option {given[0]}: expected for recordings of others, found one of this program")
+
+
 def _camera(uri: SourceUri, file: McapFile, color: Topic) -> Camera:
     topic = mcap_topics.calibration_topic(file, color, uri.options.get("camera"))
     if topic is None:
@@ -174,14 +183,7 @@ def _camera(uri: SourceUri, file: McapFile, color: Topic) -> Camera:
     message = file.message(topic, 0)
     where = _place(file, topic, message)
     found = decoding.calibration_of(topic, message.data, where)
-    matrix = found.matrix
-    if any(found.distortion) and _choice(uri, "distortion", ("refuse", "ignore")) == "refuse":
-        if "rect" not in color.name.rsplit("/", 1)[-1]:
-            raise SourceError(
-                f"{where}: expected images without lens distortion, found coefficients {list(found.distortion)}; "
-                "rectify them first, or see what comes of it with distortion=ignore"
-            )
-        matrix = found.rectified
+    matrix = _matrix(uri, found, where, is_rectified=mcap_topics.is_rectified(color))
     if not (1 <= found.width <= _MAX_SIDE and 1 <= found.height <= _MAX_SIDE):
         raise SourceError(f"{where}: expected images of 1 to {_MAX_SIDE} pixels, found {found.width}x{found.height}")
     intrinsics = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
@@ -189,6 +191,20 @@ def _camera(uri: SourceUri, file: McapFile, color: Topic) -> Camera:
         return files.integer_centred_camera(uri, width=found.width, height=found.height, intrinsics=intrinsics)
     except ValueError as error:
         raise SourceError(f"{where}: expected intrinsics, found {error}") from error
+
+
+def _matrix(uri: SourceUri, found: decoding.CalibrationMessage, where: str, *, is_rectified: bool) -> tuple[float, ...]:
+    """The 3x3 of the images by rows: K, or where they are rectified P."""
+    refuses = _choice(uri, "distortion", ("refuse", "ignore")) == "refuse"
+    if is_rectified and found.rectified[0] != 0.0:
+        return found.rectified
+    if any(found.distortion) and refuses:
+        wanted = "the matrix P of rectified images" if is_rectified else "images without lens distortion"
+        raise SourceError(
+            f"{where}: expected {wanted}, found coefficients {list(found.distortion)}; "
+            "rectify them first, or see what comes of it with distortion=ignore"
+        )
+    return found.matrix
 
 
 def _units_per_m(uri: SourceUri) -> float:

@@ -13,6 +13,8 @@ from vtslam.storage.recording.mcap_file import McapFile, Topic
 _DEPTH = re.compile("depth", re.IGNORECASE)
 _REGISTERED = re.compile("aligned|registered|to_color|to_rgb", re.IGNORECASE)
 _COMPRESSED = re.compile("compressed", re.IGNORECASE)
+_TRANSPORTS = ("compressed", "compressedDepth", "theora")  # last parts of names
+_RECTIFIED = re.compile(r"(^|_)rect(_|$|ified)", re.IGNORECASE)
 _NOT_COLOR = re.compile(r"infra|\bir\b|/ir_|disparity|mask|confidence|mono|theora", re.IGNORECASE)
 
 
@@ -65,6 +67,12 @@ def calibration_topic(file: McapFile, images: Topic, name: str | None) -> Topic 
         return found[0]
     words = images.name.split("/")
     return max(candidates, key=lambda topic: _common(words, topic.name.split("/")), default=None)
+
+
+def is_rectified(images: Topic) -> bool:
+    """Whether images are free of lens distortion, by the last part of their name that does not say how they came."""
+    parts = [part for part in images.name.split("/") if part not in _TRANSPORTS]
+    return bool(parts) and _RECTIFIED.search(parts[-1]) is not None
 
 
 def image_times_ns(file: McapFile, topic: Topic, *, by_log_time: bool) -> npt.NDArray[np.int64]:

@@ -130,12 +130,7 @@ def read_images(
             depth = _taken(path, file, int(index.depth_bytes[number]), f"the depth of frame {number}")
     except OSError as error:
         raise SourceError(f"{where}: expected a readable file, found {error.strerror}") from error
-    rgb = decoded_color(color, f"{where}: colour")
-    if rgb.shape[:2] != header.color_size[::-1]:
-        raise SourceError(
-            f"{where}: colour: expected {header.color_size[0]}x{header.color_size[1]}, found "
-            f"{rgb.shape[1]}x{rgb.shape[0]}"
-        )
+    rgb = decoded_color(color, f"{where}: colour", header.color_size)
     return rgb, _decoded_depth(f"{where}: depth", depth, header)
 
 
