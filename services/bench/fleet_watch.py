@@ -2,6 +2,7 @@
 
 import os
 import time
+from array import array
 from collections import defaultdict
 from dataclasses import dataclass, field
 
@@ -19,6 +20,8 @@ Window = tuple[int, int]  # frames
 class FleetWatch:
     """Looks at a fleet whenever frames were committed.
 
+    What it keeps is part of the supervisor's memory that it looks at, so that is eight bytes a number.
+
     Attributes:
         frames: Committed up to now.
         at_frames: Frames at each look.
@@ -28,9 +31,9 @@ class FleetWatch:
     """
 
     frames: int = 0
-    at_frames: list[int] = field(default_factory=list)
-    cpu_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    rss_mb: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    at_frames: "array[int]" = field(default_factory=lambda: array("q"))
+    cpu_s: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
+    rss_mb: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
     map_peak_mb: float = 0.0
     map_mb: float = 0.0

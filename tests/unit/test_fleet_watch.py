@@ -1,12 +1,15 @@
 """What is told of a fleet's processor time and memory, from looks at known values."""
 
+from array import array
+
 import pytest
 
 from vtslam.services.bench.fleet_watch import FleetWatch
 
 
 def watch_of(at_frames: list[int], cpu_s: list[float], rss_mb: list[float]) -> FleetWatch:
-    return FleetWatch(frames=16, at_frames=at_frames, cpu_s={"mapper": cpu_s}, rss_mb={"mapper": rss_mb})
+    cpu, rss = array("d", cpu_s), array("d", rss_mb)
+    return FleetWatch(frames=16, at_frames=array("q", at_frames), cpu_s={"mapper": cpu}, rss_mb={"mapper": rss})
 
 
 def test_growth_of_memory_is_that_from_the_second_to_the_last_quarter() -> None:
