@@ -33,6 +33,7 @@ class ChildProcess:
         epoch: How often it was started.
         status: What it said last, in this epoch; None if nothing.
         finished: Whether it came to its end.
+        is_told_to_end: Whether it was, in this epoch.
         deaths: How often it died or was killed.
         hangs: How often it was killed for being silent.
     """
@@ -44,7 +45,7 @@ class ChildProcess:
         self._handed_down = () if run_lock is None else (run_lock,)
         self.epoch = self.deaths = self.hangs = 0
         self.status: ServiceStatus | None = None
-        self.finished = False
+        self.finished = self.is_told_to_end = False
         self.peak_rss_mb = 0.0
         self._ended_counts: dict[str, int] | None = None
         self._popen: subprocess.Popen[bytes] | None = None
@@ -76,7 +77,7 @@ class ChildProcess:
     def start(self, now_s: float, environment: Mapping[str, str]) -> None:
         """Start it; the one before it is dead. From the thread that lives as long as the fleet: see `child`."""
         assert self._popen is None
-        self.epoch, self.status = self.epoch + 1, None
+        self.epoch, self.status, self.is_told_to_end = self.epoch + 1, None, False
         self._heard_s = self._present_s = now_s
         words = [self.process.name, self._fleet, "--base", str(self._folder.path.parent)]
         words += ["--epoch", str(self.epoch), "--parent", str(os.getpid())]
@@ -114,9 +115,9 @@ class ChildProcess:
         if code is None:
             return None
         self._popen = None
-        if code == 0:
-            self.finished = True
-            self._ended_counts = self._folder.counts(self.process.name)
+        counts = self._folder.counts(self.process.name, self.epoch)  # which it leaves when it has come to its end
+        if code == 0 and (self.is_told_to_end or (self.process.ends_itself and counts is not None)):
+            self.finished, self._ended_counts = True, counts
             return None
         if code == REFUSED:
             why = self._folder.failure(self.process.name)
@@ -124,8 +125,7 @@ class ChildProcess:
                 return self._died(why, now_s, frames)
             self.finished = True
             raise ProcessRefused(self.process.name, why)
-        how = f"killed by signal {-code}" if code < 0 else f"ended with status {code}"
-        return self._died(how, now_s, frames)
+        return self._died(_end_in_words(code), now_s, frames)
 
     def kill_if_hung(self, now_s: float, frames: int) -> str | None:
         """Kill it if it is silent for too long and others need it; what to tell the user then."""
@@ -160,3 +160,9 @@ class ChildProcess:
             raise FleetError(f"{text}, for the {self._deaths_here}th time without a commit in between")
         self._start_at_s = now_s + _BACK_OFF_S[self._deaths_here]
         return f"{text}; started again"
+
+
+def _end_in_words(code: int) -> str:
+    if code == 0:
+        return "ended without being told to"
+    return f"killed by signal {-code}" if code < 0 else f"ended with status {code}"

@@ -129,7 +129,7 @@ def _supervisor(
     """The supervisor of a run, which has started nothing yet."""
     processes = processes_of(settings)
     for process in processes:
-        folder.reserve_failure(process.name)
+        folder.reserve_last_words(process.name)
 
     return Supervisor(
         bus,

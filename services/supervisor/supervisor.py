@@ -255,6 +255,7 @@ class Supervisor:
         if child.pid is None or self._ordered.get(name) == (command, child.epoch):
             return
         self._ordered[name] = command, child.epoch
+        child.is_told_to_end = True
         self._orders[name].publish(
             Control(command=command, through_frame_id=through_frame_id, epoch=child.epoch, why="the run ends")
         )

@@ -170,6 +170,19 @@ def test_deaths_within_writes_to_the_run_folder_change_nothing(small: SmallRecor
     assert len(told) == len(points)
 
 
+def test_processes_that_are_asked_to_end_by_others_than_their_supervisor_do_not(
+    small: SmallRecording, tmp_path: Path
+) -> None:
+    names = ("sensor", "tracker", "mapper", "archiver")
+    asked = [(frames, name, number) for frames, number in ((3, signal.SIGTERM), (4, signal.SIGINT)) for name in names]
+    calm = Disturbance(signals=asked)
+    fleet_run(small.files, tmp_path / "run", calm)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert calm.signals == []
+    assert calm.events == []
+
+
 def test_all_processes_killed_at_once_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
     killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper", "archiver")])
     fleet_run(small.files, tmp_path / "run", killed)

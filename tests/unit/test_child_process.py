@@ -11,7 +11,7 @@ from vtslam.common.messages import ServiceState, ServiceStatus
 from vtslam.services.supervisor.child import REFUSED
 from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import FleetError, ProcessRefused
-from vtslam.services.supervisor.processes import MAPPER
+from vtslam.services.supervisor.processes import MAPPER, SENSOR, Process
 
 HANG_S = 50.0
 
@@ -40,10 +40,17 @@ class FakePopen:
 def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ChildProcess]:
     monkeypatch.setattr(subprocess, "Popen", FakePopen)
     FakePopen.started = 0
-    child = ChildProcess(MAPPER, fleet="a", folder=FleetFolder.create("a", base=tmp_path), hang_s=HANG_S)
-    child.start(0.0, {})
+    child = started(MAPPER, tmp_path)
     yield child
     child.kill()
+
+
+def started(process: Process, base: Path) -> ChildProcess:
+    folder = FleetFolder.create("a", base=base)
+    folder.reserve_last_words(process.name)
+    child = ChildProcess(process, fleet="a", folder=folder, hang_s=HANG_S)
+    child.start(0.0, {})
+    return child
 
 
 def heartbeat(epoch: int) -> ServiceStatus:
@@ -56,13 +63,40 @@ def end(child: ChildProcess, code: int) -> None:
     process.code = code
 
 
-def test_a_process_that_ends_well_is_not_started_again(child: ChildProcess) -> None:
+def test_a_process_that_ends_as_it_was_told_is_not_started_again(child: ChildProcess) -> None:
     assert child.reap(1.0, 0) is None
+    child.is_told_to_end = True
     end(child, 0)
     assert child.reap(2.0, 0) is None
     assert child.finished
     assert child.is_ready
     assert not child.is_due(99.0)
+
+
+def test_a_process_that_ends_without_being_told_to_is_started_again(child: ChildProcess) -> None:
+    child._folder.write_counts("mapper", 1, {})
+    end(child, 0)
+    assert child.reap(1.0, 3) == "mapper: ended without being told to after 3 frames; started again"
+    child.is_told_to_end = True
+    child.start(2.0, {})
+    end(child, 0)
+    assert child.reap(3.0, 3) is not None, "the order was for the one before"
+
+
+def test_a_sensor_ends_itself_when_it_says_that_its_recording_has_ended(child: ChildProcess, tmp_path: Path) -> None:
+    sensor = started(SENSOR, tmp_path)
+    end(sensor, 0)
+    assert sensor.reap(1.0, 3) == "sensor: ended without being told to after 3 frames; started again"
+    sensor._folder.write_counts("sensor", 1, {"frames.published": 4})
+    sensor.start(2.0, {})
+    end(sensor, 0)
+    assert sensor.reap(3.0, 3) is not None, "that was the one before"
+    sensor.start(4.0, {})
+    sensor._folder.write_counts("sensor", 3, {"frames.published": 5})
+    end(sensor, 0)
+    assert sensor.reap(5.0, 5) is None
+    assert sensor.finished
+    assert sensor.counters == {"frames.published": 5}
 
 
 def test_the_wait_before_a_start_grows_and_a_commit_ends_that(child: ChildProcess) -> None:
@@ -87,7 +121,6 @@ def test_many_deaths_without_a_commit_are_the_end(child: ChildProcess) -> None:
 
 
 def test_a_process_that_says_that_it_is_of_no_use_is_believed(child: ChildProcess) -> None:
-    child._folder.reserve_failure("mapper")
     child._folder.write_failure("mapper", "no room for a section")
     end(child, REFUSED)
     with pytest.raises(ProcessRefused, match="no room for a section"):
