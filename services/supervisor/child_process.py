@@ -70,28 +70,44 @@ class ChildProcess:
         """Whether it works, or has come to its end."""
         return self.finished or (self.status is not None and self.status.state in _READY)
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether it runs, and said last that there is nothing for it to do."""
+        return self._popen is not None and self.status is not None and self.status.state is ServiceState.READY
+
     def is_due(self, now_s: float) -> bool:
         """Whether it should be started now."""
         return self._popen is None and not self.finished and now_s >= self._start_at_s
 
-    def start(self, now_s: float, environment: Mapping[str, str]) -> None:
-        """Start it; the one before it is dead. From the thread that lives as long as the fleet: see `child`."""
+    def start(self, now_s: float, frames: int, environment: Mapping[str, str]) -> str | None:
+        """Start it; the one before it is dead. From the thread that lives as long as the fleet: see `child`.
+
+        Returns:
+            What to tell the user if that was refused, which is a death like others.
+
+        Raises:
+            FleetError: It died too often without a commit in between.
+        """
         assert self._popen is None
         self.epoch, self.status, self.is_told_to_end = self.epoch + 1, None, False
         self._heard_s = self._present_s = now_s
         words = [self.process.name, self._fleet, "--base", str(self._folder.path.parent)]
         words += ["--epoch", str(self.epoch), "--parent", str(os.getpid())]
         words += [word for each in self._handed_down for word in ("--run-lock", str(each))]
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", _MODULE, *words],
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **environment},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            pass_fds=self._handed_down,
-            # Ctrl-C in a terminal is for the supervisor. Not a session each: the kernel may share processors out among
-            # sessions first (autogroups), and threads that answer at once would do so only within their own.
-            process_group=0,
-        )
+        try:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-m", _MODULE, *words],
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **environment},
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=self._handed_down,
+                # Ctrl-C in a terminal is for the supervisor. Not a session each: the kernel may share processors out
+                # among sessions first (autogroups), and threads that answer at once would do so only within their own.
+                process_group=0,
+            )
+        except OSError as error:  # no memory, or too many processes, for now
+            return self._died(f"could not be started: {error.strerror}", now_s, frames)
+        return None
 
     def heard(self, status: ServiceStatus, now_s: float) -> None:
         """Take in a heartbeat; those of former starts are nobody's."""
@@ -137,6 +153,10 @@ class ChildProcess:
             why = f"silent for {limit_s:g} s"
         else:
             return None
+        return self.kill_as_hung(why, now_s, frames)
+
+    def kill_as_hung(self, why: str, now_s: float, frames: int) -> str:
+        """Kill it; what to tell the user. Raises FleetError if it died too often without a commit in between."""
         self.kill()
         self.hangs += 1
         return self._died(why, now_s, frames)
