@@ -120,7 +120,7 @@ def _quality(rng: np.random.Generator) -> TrackingQuality:
     )
 
 
-def _tracked(rng: np.random.Generator) -> Message:
+def tracked_pose(rng: np.random.Generator) -> TrackedPose:
     return TrackedPose(
         frame_id=_id(rng),
         capture_time_ns=_id(rng),
@@ -230,7 +230,7 @@ RANDOM: dict[type[Message], Callable[[np.random.Generator], Message]] = {
     FrameDescriptor: _descriptor,
     FramePixels: _pixels,
     Credit: _credit,
-    TrackedPose: _tracked,
+    TrackedPose: tracked_pose,
     Odometry: _odometry,
     FrameCommitted: _committed,
     SectionSealed: _sealed,
