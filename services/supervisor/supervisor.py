@@ -99,8 +99,7 @@ class Supervisor:
         self._orders = {name: bus.publisher(CONTROL, service=name) for name in self._children}
         self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
         self._told: set[str] = set()  # processes that were said to wait
-        self._stall = StallWatch(folder.ring_path, hang_s)
-        self._stalled_at = -1  # frames that were committed at the last stall
+        self._stall, self._stalled_at = StallWatch(folder.ring_path, hang_s), -1  # the latter: frames at the last stall
         self._phase = _Phase.RUNNING
         self._parting_ends_s: float | None = None
         self.refusal: ProcessRefused | None = None
