@@ -163,7 +163,7 @@ class Subscriber(Generic[M]):
 
     @property
     def lacks(self) -> bool:
-        """Whether publishers should be asked for more; reading does so."""
+        """Whether publishers should be asked for more soon; reading does so."""
         with self._lock:
             return (
                 not self._closed
@@ -230,7 +230,7 @@ class Subscriber(Generic[M]):
 
     def _close_gaps(self) -> None:
         """Ask publishers for what is missing, or go on without it when that is in vain."""
-        if self._ask_again is None or not self.lacks:
+        if self._ask_again is None or self._closed:
             return
         gaps, now_ns = [], self._monotonic_ns()
         with self._lock:

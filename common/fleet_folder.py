@@ -22,6 +22,7 @@ _NEW_PREFIX = ".vtslam-new-"  # then the maker's identity
 _OWNER, _RING, _MAP, _JOURNAL, _FAILED, _ENDED = "owner", "ring", "map", "journal", "failed", "ended"
 _MAX_OWNER_BYTES = 65536
 _FAILURE_BYTES = 4096
+_COUNTS_BYTES = 8192  # holds as many counters as a status has, with names of any length
 
 
 def shared_memory_folder() -> Path:
@@ -112,41 +113,54 @@ class FleetFolder:
         """Where the committed frames are written for the run folder."""
         return self.path / _JOURNAL
 
-    def write_counts(self, name: str, counters: Mapping[str, int]) -> None:
-        """Leave what a process has counted in all, when it has come to its end."""
-        (self.path / f"{_ENDED}-{checked_name(name)}").write_text(json.dumps(dict(counters)), encoding="utf-8")
+    def reserve_last_words(self, name: str) -> None:
+        """Make room for what the process ``name`` leaves at its end, which memory must not lack then.
 
-    def counts(self, name: str) -> dict[str, int] | None:
-        """What a process that has come to its end had counted; None if it left nothing."""
+        Raises:
+            SharedMemoryFull: There is not enough.
+        """
+        for kind, num_bytes in ((_FAILED, _FAILURE_BYTES), (_ENDED, _COUNTS_BYTES)):
+            path = self._last_words(kind, name)
+            path.unlink(missing_ok=True)
+            fd = make_file(path, num_bytes)
+            try:
+                reserve(path, fd, 0, num_bytes)
+            finally:
+                os.close(fd)
+
+    def write_counts(self, name: str, epoch: int, counters: Mapping[str, int]) -> None:
+        """Leave what a process has counted in all, when its ``epoch``-th start has come to its end."""
+        words = json.dumps({"epoch": epoch, "counters": dict(counters)})
+        self._write_last_words(_ENDED, name, words, _COUNTS_BYTES)
+
+    def counts(self, name: str, epoch: int) -> dict[str, int] | None:
+        """What a process had counted whose ``epoch``-th start has come to its end; None if it left nothing."""
         try:
-            return dict(json.loads((self.path / f"{_ENDED}-{checked_name(name)}").read_text(encoding="utf-8")))
-        except (OSError, ValueError):
+            left = json.loads(self._read_last_words(_ENDED, name))
+            return dict(left["counters"]) if left["epoch"] == epoch else None
+        except ValueError:
             return None
 
-    def reserve_failure(self, name: str) -> None:
-        """Make room for :meth:`write_failure`, whose reason may be that there is none; raises SharedMemoryFull."""
-        path = self._failure_path(name)
-        path.unlink(missing_ok=True)
-        fd = make_file(path, _FAILURE_BYTES)
-        try:
-            reserve(path, fd, 0, _FAILURE_BYTES)
-        finally:
-            os.close(fd)
-
     def write_failure(self, name: str, text: str) -> None:
-        """Leave word of why the process ``name`` cannot go on, in the room reserved for it."""
-        with open(self._failure_path(name), "r+b") as file:
-            file.write(text.encode()[:_FAILURE_BYTES].ljust(_FAILURE_BYTES, b"\0"))
+        """Leave word of why the process ``name`` cannot go on."""
+        self._write_last_words(_FAILED, name, text, _FAILURE_BYTES)
 
     def failure(self, name: str) -> str:
         """What :meth:`write_failure` left; empty if nothing."""
+        return self._read_last_words(_FAILED, name)
+
+    def _write_last_words(self, kind: str, name: str, text: str, num_bytes: int) -> None:
+        with open(self._last_words(kind, name), "r+b") as file:
+            file.write(text.encode()[:num_bytes].ljust(num_bytes, b"\0"))
+
+    def _read_last_words(self, kind: str, name: str) -> str:
         try:
-            return self._failure_path(name).read_bytes().rstrip(b"\0").decode(errors="replace")
+            return self._last_words(kind, name).read_bytes().rstrip(b"\0").decode(errors="replace")
         except FileNotFoundError:
             return ""
 
-    def _failure_path(self, name: str) -> Path:
-        return self.path / f"{_FAILED}-{checked_name(name)}"
+    def _last_words(self, kind: str, name: str) -> Path:
+        return self.path / f"{kind}-{checked_name(name)}"
 
     def remove(self) -> None:
         """Delete the folder and all blocks; memory is freed when the last process has unmapped it."""

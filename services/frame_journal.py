@@ -7,6 +7,7 @@ replaces an earlier one; the line that ends a section also says what a run goes 
 
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,16 +76,18 @@ class JournalReader:
     def __init__(self, folder: Path) -> None:
         self._folder, self._section_id, self._offset = folder, 0, 0
 
-    def new_lines(self) -> list[JournalLine]:
-        """The whole lines that were not read before, in order."""
-        lines = []
+    def new_lines(self) -> Iterator[JournalLine]:
+        """The whole lines that were not read before, in order.
+
+        Raises:
+            ValueError, KeyError, TypeError: A line is damaged; it and those behind it count as not read.
+        """
         # Seen before this section's file is read, so that it is complete if a later one is there.
         while (last := self._last_section()) is not None and last >= self._section_id:
-            lines += self._new_lines_here()
+            yield from self._new_lines_here()
             if last == self._section_id:
                 break
             self._section_id, self._offset = self._section_id + 1, 0
-        return lines
 
     def forget_before(self, section_id: int) -> None:
         """Delete the lines of sections before this one, which are durable."""
@@ -104,16 +107,17 @@ class JournalReader:
     def _last_section(self) -> int | None:
         return max(self._sections(), default=None)
 
-    def _new_lines_here(self) -> list[JournalLine]:
+    def _new_lines_here(self) -> Iterator[JournalLine]:
         try:
             with open(_path(self._folder, self._section_id), "rb") as file:
                 file.seek(self._offset)
                 data = file.read()
         except FileNotFoundError:
-            return []
-        whole = data.rfind(b"\n") + 1
-        self._offset += whole
-        return [_line_of(line) for line in data[:whole].splitlines()]
+            return
+        for line in data.split(b"\n")[:-1]:
+            found = _line_of(line)
+            self._offset += len(line) + 1
+            yield found
 
 
 def _path(folder: Path, section_id: int) -> Path:

@@ -1,8 +1,6 @@
 """What every service of a fleet says of itself, and what it is told."""
 
 import os
-import signal
-from types import FrameType
 
 from vtslam.common.bus import Bus, Publisher
 from vtslam.common.messages import Command, FleetEvent, ServiceState, ServiceStatus
@@ -53,15 +51,6 @@ class ServiceLink:
                 self.stopping = True
             elif order.command is Command.DRAIN:
                 self.drain_through = order.through_frame_id
-
-    def stop_on_sigterm(self) -> None:
-        """Take SIGTERM as the order to stop; Ctrl-C is the supervisor's affair."""
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            self.stopping = True
-
-        signal.signal(signal.SIGTERM, stop)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def tell(self, state: ServiceState, last_frame_id: int, *, detail: str = "") -> None:
         """A heartbeat, if the last one is long ago or the state has changed."""

@@ -13,6 +13,7 @@ MAX_SIDE_PX = 8192  # of an image
 MAX_PIXELS = 4096 * 2160  # of an image: bounds the memory a frame of another host can take
 
 Count = Annotated[int, Integer(0, MAX_INT)]  # a number of things, an id, an epoch, nanoseconds
+CaptureTime = Annotated[int, Integer(0, 2**62)]  # nanoseconds; leaves room in an int64 for what follows
 OptionalId = Annotated[int, Integer(-1, MAX_INT)]  # -1: none
 Name = Annotated[str, NAME]
 Note = Annotated[str, Text(256)]

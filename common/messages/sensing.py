@@ -12,6 +12,7 @@ from vtslam.common.geometry.camera import Camera
 from vtslam.common.messages.base import (
     CAMERA,
     MAX_PIXELS,
+    CaptureTime,
     Count,
     DepthScale,
     Message,
@@ -90,7 +91,7 @@ class FramePixels(Message):
 
     stream: Name
     frame_id: Count
-    capture_time_ns: Count
+    capture_time_ns: CaptureTime
     depth_scale_m: DepthScale
     camera: Annotated[Camera, CAMERA]
     rgb: Annotated[npt.NDArray[np.uint8], Pixels("u1", 3)]

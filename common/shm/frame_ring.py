@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,10 +26,11 @@ from vtslam.common.shm.blocks import (
 )
 from vtslam.common.shm.errors import FrameGone, RingFull, SharedMemoryError
 from vtslam.common.shm.pins import Pin
-from vtslam.common.shm.process_identity import own_identity
+from vtslam.common.shm.process_identity import is_alive, own_identity
 from vtslam.common.shm.ring_layout import DESCRIPTION, FrameDescriptor, RingArea, RingSpec
 
 _W_ACKNOWLEDGED, _W_LOST, _W_RECORDED = W_COUNTER_A, W_COUNTER_B, W_COUNTER_C
+_HEX = re.compile("[0-9a-f]{1,16}")
 _POLL_S = 0.0005
 
 
@@ -133,6 +135,7 @@ class FrameRingWriter(_Ring):
         """
         if path.exists():
             raise SharedMemoryError(f"{path}: expected nothing, found a file")
+        _remove_unfinished(path)
         new = path.with_name(f".new-{own_identity():x}-{path.name}")
         fd = make_file(new, spec.file_bytes)
         try:
@@ -260,6 +263,14 @@ class FrameRingWriter(_Ring):
                 self._control.words.fetch_add(_W_LOST, 1)
             return slot
         return None
+
+
+def _remove_unfinished(path: Path) -> None:
+    """Give back what writers reserved that died before their ring was there."""
+    for left in path.parent.glob(f".new-*-{path.name}"):
+        maker = left.name.removeprefix(".new-").removesuffix(f"-{path.name}")
+        if _HEX.fullmatch(maker) and not is_alive(int(maker, 16)):
+            left.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

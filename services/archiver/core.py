@@ -1,6 +1,6 @@
 """Which finished sections are in memory: facts in, decisions out."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,17 +25,20 @@ class StoreFacts:
 
     Attributes:
         used_bytes, free_bytes: What all blocks take, and what they may take beside that.
-        residents: The finished sections in memory, in order.
+        sealed_bytes: What each finished section in memory takes of it.
     """
 
     used_bytes: int
     free_bytes: int
-    residents: tuple[ResidentFacts, ...]
+    sealed_bytes: tuple[int, ...]
 
     @property
     def mapping_bytes(self) -> int:
         """What is taken by all but finished sections."""
-        return self.used_bytes - sum(each.num_bytes for each in self.residents)
+        return self.used_bytes - sum(self.sealed_bytes)
+
+
+Residents = Callable[[], Sequence[ResidentFacts]]  # finished sections in memory, in order; a look at all takes a while
 
 
 class Residency:
@@ -50,20 +53,23 @@ class Residency:
     def observe(self, facts: StoreFacts) -> None:
         """Learn what mapping takes."""
         self._most_mapping = max(self._most_mapping, facts.mapping_bytes)
-        self._most_sealed = max(self._most_sealed, *(each.num_bytes for each in facts.residents), 0)
+        self._most_sealed = max(self._most_sealed, *facts.sealed_bytes, 0)
 
-    def leaving(self, facts: StoreFacts, *, squeeze: bool, spared: Iterable[int] = ()) -> tuple[int, ...]:
+    def leaving(
+        self, facts: StoreFacts, residents: Residents, *, squeeze: bool, spared: Iterable[int] = ()
+    ) -> tuple[int, ...]:
         """The sections that are to leave, in this order.
 
         Args:
             facts: The store.
+            residents: Asked for only if some may have to leave.
             squeeze: The mapper waits for memory: all go that may.
             spared: Sections that leave last.
         """
         wanted = self._kept_free(facts)
         if not squeeze and wanted <= facts.free_bytes:
             return ()
-        may_leave = [each for each in facts.residents[:-1] if each.is_verified and not each.is_pinned]
+        may_leave = [each for each in residents()[:-1] if each.is_verified and not each.is_pinned]
         attainable = facts.free_bytes + sum(each.num_bytes for each in may_leave)
         wanted = attainable if squeeze else min(wanted, attainable)
         return make_room(
@@ -74,11 +80,16 @@ class Residency:
             wanted_soon=spared,
         ).leaving
 
-    def room_for(self, facts: StoreFacts, num_bytes: int, *, spared: Iterable[int] = ()) -> tuple[int, ...] | None:
+    def room_for(
+        self, facts: StoreFacts, residents: Residents, num_bytes: int, *, spared: Iterable[int] = ()
+    ) -> tuple[int, ...] | None:
         """What leaves so that a section of ``num_bytes`` can come back beside what mapping needs; None if it cannot."""
+        wanted = self._kept_free(facts) + num_bytes
+        if wanted <= facts.free_bytes:
+            return ()
         plan = make_room(
-            facts.residents[:-1],
-            wanted_bytes=self._kept_free(facts) + num_bytes,
+            residents()[:-1],
+            wanted_bytes=wanted,
             used_bytes=facts.used_bytes,
             budget_bytes=facts.used_bytes + facts.free_bytes,
             wanted_soon=spared,

@@ -71,23 +71,24 @@ class FleetRecord:
 
     def finish(self, *, finished: bool, interrupted: bool, seconds: float, peak_rss_mb: float) -> RunSummary:
         """Write everything that is not written yet; see `RunRecord.finish`."""
-        self._write_all()
+        self.take_frames()
+        self._write_finished()
         return self._record.finish(finished=finished, interrupted=interrupted, seconds=seconds, peak_rss_mb=peak_rss_mb)
 
     def finish_broken(self, *, seconds: float, peak_rss_mb: float) -> None:
         """Write what is known of a fleet that cannot go on; the frames of its open section are in no section file."""
-        self._write_all()
-        with contextlib.suppress(SharedMemoryError):  # which may be why the fleet cannot go on
+        # Damage may be why it cannot go on. What lies before it in the journal is known all the same.
+        with contextlib.suppress(SharedMemoryError, ValueError, KeyError, TypeError):
+            self.take_frames()
             last = self._store.last_commit()  # whoever committed it may have died before it wrote to the journal
             if last is not None:
                 facts = CommitFacts.unpacked(last.facts)
                 self._record.add(facts.frame)
                 if last.is_sealed and last.section_id >= self.num_durable:
                     self._ended[last.section_id] = facts
-                    self._write_all()
+        self._write_finished()
         self._record.finish_broken(seconds=seconds, peak_rss_mb=peak_rss_mb)
 
-    def _write_all(self) -> None:
-        self.take_frames()
+    def _write_finished(self) -> None:
         while self.write_next() is not None:
             pass

@@ -8,7 +8,7 @@ from vtslam.common.shm.errors import MapStoreFull, SectionPinned, SharedMemoryFu
 from vtslam.common.shm.map_store import MapStore
 from vtslam.common.shm.residency import ResidentFacts
 from vtslam.services.archiver.archived import ArchivedSections
-from vtslam.services.archiver.core import Residency, StoreFacts
+from vtslam.services.archiver.core import Residency, Residents, StoreFacts
 from vtslam.storage.catalog_rows import STORED
 from vtslam.storage.errors import StorageError
 from vtslam.storage.run_folder import RunFolder
@@ -38,15 +38,14 @@ class ResidentSections:
             squeeze: The mapper waits for memory.
             spared: Sections that leave last.
         """
-        facts = self._facts(num_durable)
+        facts = self._facts()
         self._residency.observe(facts)
-        self._let_go(self._residency.leaving(facts, squeeze=squeeze, spared=spared))
+        self._let_go(self._residency.leaving(facts, self._residents(num_durable), squeeze=squeeze, spared=spared))
 
     def has_room_for(self, section_id: int, num_durable: int, *, spared: Iterable[int]) -> bool:
         """Whether a section can come back without one of ``spared`` leaving."""
-        leaving = self._residency.room_for(
-            self._facts(num_durable), self._archived.num_bytes(section_id), spared=spared
-        )
+        num_bytes = self._archived.num_bytes(section_id)
+        leaving = self._residency.room_for(self._facts(), self._residents(num_durable), num_bytes, spared=spared)
         return leaving is not None and not set(leaving) & set(spared)
 
     def bring(self, section_id: int, num_durable: int, *, spared: Iterable[int]) -> tuple[LoadOutcome, str]:
@@ -56,7 +55,7 @@ class ResidentSections:
         if section_id >= num_durable:
             return LoadOutcome.UNKNOWN, f"section {section_id} is not on disk"
         num_bytes = self._archived.num_bytes(section_id)
-        leaving = self._residency.room_for(self._facts(num_durable), num_bytes, spared=spared)
+        leaving = self._residency.room_for(self._facts(), self._residents(num_durable), num_bytes, spared=spared)
         if leaving is None:
             return LoadOutcome.NO_ROOM, f"no room for {num_bytes} bytes beside what mapping needs"
         try:
@@ -79,16 +78,22 @@ class ResidentSections:
             with contextlib.suppress(SectionPinned):  # since this looked
                 self._store.unlink_sealed(section_id, verified_on_disk=True)
 
-    def _facts(self, num_durable: int) -> StoreFacts:
-        residents = tuple(
-            ResidentFacts(
-                section_id=resident.section_id,
-                num_bytes=resident.num_bytes,
-                last_used=resident.last_used_ns,
-                is_pinned=bool(resident.pinned_by),
-                is_verified=resident.section_id < num_durable,
-            )
-            for resident in self._store.residents()
-        )
+    def _facts(self) -> StoreFacts:
         used_bytes, free_bytes = self._store.used_bytes(), self._store.free_bytes()
-        return StoreFacts(used_bytes=used_bytes, free_bytes=free_bytes, residents=residents)
+        sealed_bytes = tuple(self._store.sealed_bytes().values())
+        return StoreFacts(used_bytes=used_bytes, free_bytes=free_bytes, sealed_bytes=sealed_bytes)
+
+    def _residents(self, num_durable: int) -> Residents:
+        def look() -> list[ResidentFacts]:
+            return [
+                ResidentFacts(
+                    section_id=resident.section_id,
+                    num_bytes=resident.num_bytes,
+                    last_used=resident.last_used_ns,
+                    is_pinned=bool(resident.pinned_by),
+                    is_verified=resident.section_id < num_durable,
+                )
+                for resident in self._store.residents()
+            ]
+
+        return look

@@ -36,7 +36,7 @@ class PoseIntake(Protocol):
 
 
 class EveryPose:
-    """All poses, in order (lockstep, pipelined).
+    """All poses, in order (lockstep, pipelined); one that is repeated while it is mapped is forgotten afterwards.
 
     Args:
         bus: The mapper's session.
@@ -51,8 +51,9 @@ class EveryPose:
     def listen(self, num_frames: int, sequence: int, *, section_id: int, row: int) -> None:
         """See `PoseIntake`."""
         while (tracked := self._tracked.receive()) is not None:
-            if tracked.message.frame_id >= num_frames:
-                self._poses[tracked.message.frame_id] = tracked.message
+            self._poses[tracked.message.frame_id] = tracked.message
+        for frame_id in [each for each in self._poses if each < num_frames]:
+            del self._poses[frame_id]
 
     def take(self, num_frames: int) -> TrackedPose | None:
         """See `PoseIntake`."""

@@ -104,6 +104,7 @@ class MapperService:
     def step(self) -> float | None:
         """See `Steps`."""
         self._link.poll()
+        self._hear_of_archived()  # also while there is room: what is not read for long is lost
         section_id, row = self._place()
         sequence = 0 if self._facts is None else self._facts.sequence
         self._intake.listen(self._num_frames, sequence, section_id=section_id, row=row)
@@ -261,14 +262,16 @@ class MapperService:
     def _wait_for_room(self, error: MapStoreFull | SharedMemoryFull) -> float:
         """Sections leave the store once they are on disk; if that does not help in time, the error is raised."""
         now_ns, sealed = self._clock.monotonic_ns(), self._store.sealed_ids()
-        while (archived := self._archived.receive()) is not None:
-            self._num_durable = max(self._num_durable, archived.message.section_id + 1)
         if self._no_room_since_ns is None or any(section_id >= self._num_durable for section_id in sealed):
             self._no_room_since_ns = now_ns  # what the disk takes is not this service's to judge
         if not sealed or now_ns - self._no_room_since_ns > _GIVE_UP_S * 1e9:
             raise error
         self._link.tell(ServiceState.DEGRADED, self._last_frame_id, detail=f"waits: {error}")
         return _NO_ROOM_S
+
+    def _hear_of_archived(self) -> None:
+        while (archived := self._archived.receive()) is not None:
+            self._num_durable = max(self._num_durable, archived.message.section_id + 1)
 
     # --- the end of a section ---------------------------------------------------------------------------------------
 

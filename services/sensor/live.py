@@ -13,6 +13,7 @@ from vtslam.services.sensor.ring import descriptor_message, make_ring
 from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 
 WINDOW = 4  # frames a publisher may have under way
+_FAR_AHEAD_NS = 86_400_000_000_000  # of the frame before: a day, which no pause of a camera takes
 
 
 class LiveSensor:
@@ -20,8 +21,9 @@ class LiveSensor:
 
     The fleet numbers its frames from 0, and says in its credit which number it wants next; a publisher counts from
     there. A publisher keeps what is not committed, so a sensor that starts again gets it again. Frames of other
-    numbers, of another camera or scale than the first one's, are refused and counted. Times that do not increase are
-    counted too, and taken for the nanosecond after the one before.
+    numbers, of another camera or scale than the first one's, and of a time far ahead of the one before, which all later
+    ones would have to follow, are refused and counted. Times that do not increase are counted too, and taken for the
+    nanosecond after the one before.
 
     Without a credit (realtime) a frame in the ring is done with for its publisher, whatever becomes of it there.
 
@@ -55,6 +57,7 @@ class LiveSensor:
         self._link.poll()
         while self._commits.receive() is not None:
             pass  # what is committed is acknowledged in the ring
+        self._link.counters["frames.published"] = self._wanted
         if self._link.stopping:
             self._link.tell(ServiceState.FINISHED, self._wanted - 1)
             return None
@@ -89,7 +92,6 @@ class LiveSensor:
             return False
         self._pending, self._last = None, frame
         self._announce(frame, descriptor, condition)
-        self._link.counters["frames.published"] = self._wanted
         if condition is not FrameCondition.OK:
             self._link.count(f"frames.{condition}")
         return True
@@ -106,6 +108,9 @@ class LiveSensor:
         last = self._last
         if last is not None and (last.camera, last.depth_scale_m) != (pixels.camera, pixels.depth_scale_m):
             self._link.count("frames.other_camera")
+            return False
+        if last is not None and pixels.capture_time_ns - last.capture_time_ns > _FAR_AHEAD_NS:
+            self._link.count("frames.other_time")
             return False
         return True
 

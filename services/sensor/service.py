@@ -51,6 +51,7 @@ class RecordingSensor:
         self._link.poll()
         while self._commits.receive() is not None:
             pass  # what is committed is acknowledged in the ring
+        self._link.counters["frames.published"] = self._next
         if self._link.stopping or self._next == len(self._source):
             self._link.tell(ServiceState.FINISHED, self._next - 1)
             return None
@@ -61,7 +62,6 @@ class RecordingSensor:
             return HEARTBEAT_S
         self._announce(frame, descriptor, read_s)
         self._next, self._read = self._next + 1, None
-        self._link.counters["frames.published"] = self._next
         self._link.tell(ServiceState.WORKING, self._next - 1)
         return 0.0
 

@@ -67,13 +67,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     words.add_argument("--parent", type=int, required=True)
     words.add_argument("--run-lock", type=int)
     args = words.parse_args(argv)
-    _die_with(args.parent)
+    _leave_ending_to_the_supervisor(args.parent)
     folder = FleetFolder.open(args.fleet, base=args.base)
     return _run(args, folder)
 
 
-def _die_with(parent: int) -> None:
-    """Be killed when the supervisor dies, also if that happened before this call."""
+def _leave_ending_to_the_supervisor(parent: int) -> None:
+    """Be killed when it dies, also if that happened before this call, and heed no request to end but its orders.
+
+    SIGTERM comes to all processes of a service that systemd stops: a fleet without its mapper could finish nothing.
+    """
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -108,11 +113,10 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
     member = Member(fleet=args.fleet, role=process.role, name=name)
     with join(member, folder.path) as bus:
         link = ServiceLink(bus, args.epoch)
-        link.stop_on_sigterm()
         try:
             parts = _Parts(bus, link, folder, run, settings, info.facts.source, args.run_lock)
             run_steps(_BUILDERS[name](parts), bus)
-            folder.write_counts(name, link.counters)
+            folder.write_counts(name, args.epoch, link.counters)
         except (SourceError, StorageError, MapStoreFull, SharedMemoryFull, ViewerError) as error:
             folder.write_failure(name, str(error))
             return REFUSED

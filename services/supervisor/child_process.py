@@ -33,6 +33,7 @@ class ChildProcess:
         epoch: How often it was started.
         status: What it said last, in this epoch; None if nothing.
         finished: Whether it came to its end.
+        is_told_to_end: Whether it was, in this epoch.
         deaths: How often it died or was killed.
         hangs: How often it was killed for being silent.
     """
@@ -44,7 +45,7 @@ class ChildProcess:
         self._handed_down = () if run_lock is None else (run_lock,)
         self.epoch = self.deaths = self.hangs = 0
         self.status: ServiceStatus | None = None
-        self.finished = False
+        self.finished = self.is_told_to_end = False
         self.peak_rss_mb = 0.0
         self._ended_counts: dict[str, int] | None = None
         self._popen: subprocess.Popen[bytes] | None = None
@@ -69,28 +70,44 @@ class ChildProcess:
         """Whether it works, or has come to its end."""
         return self.finished or (self.status is not None and self.status.state in _READY)
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether it runs, and said last that there is nothing for it to do."""
+        return self._popen is not None and self.status is not None and self.status.state is ServiceState.READY
+
     def is_due(self, now_s: float) -> bool:
         """Whether it should be started now."""
         return self._popen is None and not self.finished and now_s >= self._start_at_s
 
-    def start(self, now_s: float, environment: Mapping[str, str]) -> None:
-        """Start it; the one before it is dead. From the thread that lives as long as the fleet: see `child`."""
+    def start(self, now_s: float, frames: int, environment: Mapping[str, str]) -> str | None:
+        """Start it; the one before it is dead. From the thread that lives as long as the fleet: see `child`.
+
+        Returns:
+            What to tell the user if that was refused, which is a death like others.
+
+        Raises:
+            FleetError: It died too often without a commit in between.
+        """
         assert self._popen is None
-        self.epoch, self.status = self.epoch + 1, None
+        self.epoch, self.status, self.is_told_to_end = self.epoch + 1, None, False
         self._heard_s = self._present_s = now_s
         words = [self.process.name, self._fleet, "--base", str(self._folder.path.parent)]
         words += ["--epoch", str(self.epoch), "--parent", str(os.getpid())]
         words += [word for each in self._handed_down for word in ("--run-lock", str(each))]
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", _MODULE, *words],
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **environment},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            pass_fds=self._handed_down,
-            # Ctrl-C in a terminal is for the supervisor. Not a session each: the kernel may share processors out among
-            # sessions first (autogroups), and threads that answer at once would do so only within their own.
-            process_group=0,
-        )
+        try:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-m", _MODULE, *words],
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **environment},
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=self._handed_down,
+                # Ctrl-C in a terminal is for the supervisor. Not a session each: the kernel may share processors out
+                # among sessions first (autogroups), and threads that answer at once would do so only within their own.
+                process_group=0,
+            )
+        except OSError as error:  # no memory, or too many processes, for now
+            return self._died(f"could not be started: {error.strerror}", now_s, frames)
+        return None
 
     def heard(self, status: ServiceStatus, now_s: float) -> None:
         """Take in a heartbeat; those of former starts are nobody's."""
@@ -114,9 +131,9 @@ class ChildProcess:
         if code is None:
             return None
         self._popen = None
-        if code == 0:
-            self.finished = True
-            self._ended_counts = self._folder.counts(self.process.name)
+        counts = self._folder.counts(self.process.name, self.epoch)  # which it leaves when it has come to its end
+        if code == 0 and (self.is_told_to_end or (self.process.ends_itself and counts is not None)):
+            self.finished, self._ended_counts = True, counts
             return None
         if code == REFUSED:
             why = self._folder.failure(self.process.name)
@@ -124,8 +141,7 @@ class ChildProcess:
                 return self._died(why, now_s, frames)
             self.finished = True
             raise ProcessRefused(self.process.name, why)
-        how = f"killed by signal {-code}" if code < 0 else f"ended with status {code}"
-        return self._died(how, now_s, frames)
+        return self._died(_end_in_words(code), now_s, frames)
 
     def kill_if_hung(self, now_s: float, frames: int) -> str | None:
         """Kill it if it is silent for too long and others need it; what to tell the user then."""
@@ -137,6 +153,10 @@ class ChildProcess:
             why = f"silent for {limit_s:g} s"
         else:
             return None
+        return self.kill_as_hung(why, now_s, frames)
+
+    def kill_as_hung(self, why: str, now_s: float, frames: int) -> str:
+        """Kill it; what to tell the user. Raises FleetError if it died too often without a commit in between."""
         self.kill()
         self.hangs += 1
         return self._died(why, now_s, frames)
@@ -160,3 +180,9 @@ class ChildProcess:
             raise FleetError(f"{text}, for the {self._deaths_here}th time without a commit in between")
         self._start_at_s = now_s + _BACK_OFF_S[self._deaths_here]
         return f"{text}; started again"
+
+
+def _end_in_words(code: int) -> str:
+    if code == 0:
+        return "ended without being told to"
+    return f"killed by signal {-code}" if code < 0 else f"ended with status {code}"

@@ -21,12 +21,12 @@ from vtslam.services.process_facts import peak_rss_mb
 from vtslam.services.resume import ResumePoint
 from vtslam.services.run_record import RunSummary
 from vtslam.services.sensor.sources.base import SourceError
-from vtslam.services.supervisor.errors import FleetError
 from vtslam.services.supervisor.metrics import FleetMetrics, metrics_server
 from vtslam.services.supervisor.processes import LIVE_SOURCE, processes_of
 from vtslam.services.supervisor.progress import FleetProgress
 from vtslam.services.supervisor.store import map_store
 from vtslam.services.supervisor.supervisor import Environment, Supervisor
+from vtslam.storage.errors import WriteFailed
 from vtslam.storage.run_folder import RunFolder
 from vtslam.storage.section_convert import SectionArchive
 
@@ -100,9 +100,11 @@ def run_in_fleet(
             with metrics_server(settings.fleet.metrics_port, metrics, supervisor.children, store):
                 try:
                     interrupted = _supervised(supervisor, bus, hooks)
-                except FleetError:
-                    record = FleetRecord(run, store, JournalReader(folder.journal_path))
-                    record.finish_broken(seconds=time.perf_counter() - start_s, peak_rss_mb=_peak_rss_mb(supervisor))
+                except Exception as error:
+                    if not isinstance(error, WriteFailed):  # whatever it is, what is in memory alone would go with it
+                        record = FleetRecord(run, store, JournalReader(folder.journal_path))
+                        seconds = time.perf_counter() - start_s
+                        record.finish_broken(seconds=seconds, peak_rss_mb=_peak_rss_mb(supervisor))
                     raise
         summary = FleetRecord(run, store, JournalReader(folder.journal_path)).finish(
             finished=not interrupted and supervisor.refusal is None,
@@ -129,7 +131,7 @@ def _supervisor(
     """The supervisor of a run, which has started nothing yet."""
     processes = processes_of(settings)
     for process in processes:
-        folder.reserve_failure(process.name)
+        folder.reserve_last_words(process.name)
 
     return Supervisor(
         bus,

@@ -15,20 +15,22 @@ class Process:
         role: What it may publish.
         after: Processes that are ready before it is started, as far as the fleet has them.
         is_expendable: Whether the fleet goes on without it: it is not started again, and nobody waits for it.
+        ends_itself: Whether it may come to its end without being told to.
     """
 
     name: str
     role: Role
     after: tuple[str, ...] = ()
     is_expendable: bool = False
+    ends_itself: bool = False
 
 
-SENSOR = Process(name="sensor", role=Role.SENSOR, after=("mapper", "tracker", "recorder"))
+SENSOR = Process(name="sensor", role=Role.SENSOR, after=("mapper", "tracker", "recorder"), ends_itself=True)
 TRACKER = Process(name="tracker", role=Role.TRACKER)
 MAPPER = Process(name="mapper", role=Role.MAPPER)
 ARCHIVER = Process(name="archiver", role=Role.ARCHIVER)
 RECORDER = Process(name="recorder", role=Role.RECORDER)
-VIEWER = Process(name="viewer", role=Role.VIEWER, is_expendable=True)
+VIEWER = Process(name="viewer", role=Role.VIEWER, is_expendable=True, ends_itself=True)
 
 LIVE_SOURCE = "live:"  # in run.toml: frames come from publishers
 

@@ -20,9 +20,10 @@ from vtslam.common.topics import (
 from vtslam.services.pacing import Pacing
 from vtslam.services.service_link import ServiceLink
 from vtslam.services.supervisor.child_process import ChildProcess
-from vtslam.services.supervisor.errors import ProcessRefused
+from vtslam.services.supervisor.errors import FleetError, ProcessRefused
 from vtslam.services.supervisor.processes import ARCHIVER, MAPPER, PROCESSES, RECORDER, SENSOR, TRACKER, VIEWER, Process
 from vtslam.services.supervisor.progress import FleetProgress
+from vtslam.services.supervisor.stall import StallWatch
 from vtslam.storage.errors import WriteFailed
 
 _POLL_S = 0.1  # between looks at the processes, when the bus is silent
@@ -98,6 +99,7 @@ class Supervisor:
         self._orders = {name: bus.publisher(CONTROL, service=name) for name in self._children}
         self._ordered: dict[str, tuple[Command, int]] = {}  # the last order of each process, and its epoch then
         self._told: set[str] = set()  # processes that were said to wait
+        self._stall, self._stalled_at = StallWatch(folder.ring_path, hang_s), -1  # the latter: frames at the last stall
         self._phase = _Phase.RUNNING
         self._parting_ends_s: float | None = None
         self.refusal: ProcessRefused | None = None
@@ -173,17 +175,34 @@ class Supervisor:
                     raise
                 self.refusal = refusal  # what was read before is mapped to its end
                 event = None
-            event = event or child.kill_if_hung(now_s, self.progress.num_frames)
-            if event is not None:
-                self._link.event("restarted", event)
-                self._on_event(event)
+            self._tell_of_death(event or child.kill_if_hung(now_s, self.progress.num_frames))
+        self._end_stall(now_s)
+
+    def _end_stall(self, now_s: float) -> None:
+        """Start tracker and mapper again if frames wait and neither of them does anything, whatever they lack."""
+        frames, workers = self.progress.num_frames, [self._children[each.name] for each in (TRACKER, MAPPER)]
+        waits = self._pacing is not Pacing.REALTIME and all(child.is_waiting for child in workers)
+        if not self._stall.is_there(now_s, frames, waits=waits):
+            return
+        why = f"did nothing for {self._stall.limit_s:g} s although frames wait"
+        if self._stalled_at == frames:
+            raise FleetError(f"{TRACKER.name}, {MAPPER.name}: {why} after {frames} frames, for the 2nd time")
+        self._stalled_at = frames
+        for child in workers:
+            self._tell_of_death(child.kill_as_hung(why, now_s, frames))
+
+    def _tell_of_death(self, event: str | None) -> None:
+        if event is not None:
+            self._link.event("restarted", event)
+            self._on_event(event)
 
     def _start_due(self) -> None:
         now_s = self._now_s()
         for name, child in self._children.items():
             ready = all(self._children[other].is_ready for other in child.process.after if other in self._children)
             if child.is_due(now_s) and (ready or child.epoch > 0):
-                child.start(now_s, self._environment(name, child.epoch + 1))
+                environment = self._environment(name, child.epoch + 1)
+                self._tell_of_death(child.start(now_s, self.progress.num_frames, environment))
 
     def _tell(self, state: ServiceState) -> None:
         for name, child in self._children.items():
@@ -224,7 +243,7 @@ class Supervisor:
             self._order(self._children[ARCHIVER.name], Command.DRAIN)
             recorder = self._children.get(RECORDER.name)
             if recorder is not None:
-                self._end(recorder)
+                self._order(recorder, Command.STOP)  # one that died is started again, and records the rest
             if all(child.finished for child in self._children.values() if not child.process.is_expendable):
                 self._phase = _Phase.SHOWING
         if self._phase is _Phase.SHOWING:
@@ -255,6 +274,7 @@ class Supervisor:
         if child.pid is None or self._ordered.get(name) == (command, child.epoch):
             return
         self._ordered[name] = command, child.epoch
+        child.is_told_to_end = True
         self._orders[name].publish(
             Control(command=command, through_frame_id=through_frame_id, epoch=child.epoch, why="the run ends")
         )

@@ -43,8 +43,8 @@ class PosePublisher:
         num_tracked: int,
         read_s: float,
         track_s: float,
-    ) -> None:
-        """Publish the pose of ``frame``.
+    ) -> TrackedPose:
+        """Publish the pose of ``frame``; returns what was said.
 
         Args:
             frame: The frame.
@@ -60,29 +60,34 @@ class PosePublisher:
         """
         T_world_camera = untracked_pose(frame) if result is None else result.T_world_camera
         covariance = np.zeros((6, 6)) if result is None else _sendable(result.covariance)
-        self._poses.publish(
-            TrackedPose(
-                frame_id=frame.frame_id,
-                capture_time_ns=frame.capture_time_ns,
-                slot=descriptor.slot,
-                slot_sequence=descriptor.sequence,
-                section_id=section_id,
-                generation=generation,
-                epoch=self._link.epoch,
-                T_world_camera=T_world_camera,
-                covariance=covariance,
-                quality=None if result is None else _quality(result),
-                state=TrackingState.OK if result is None else result.state,
-                overlap_section_id=-1 if result is None else result.overlap_section_id,
-                history=after.history(),
-                num_tracked=num_tracked,
-                read_s=read_s,
-                track_s=track_s,
-            )
+        pose = TrackedPose(
+            frame_id=frame.frame_id,
+            capture_time_ns=frame.capture_time_ns,
+            slot=descriptor.slot,
+            slot_sequence=descriptor.sequence,
+            section_id=section_id,
+            generation=generation,
+            epoch=self._link.epoch,
+            T_world_camera=T_world_camera,
+            covariance=covariance,
+            quality=None if result is None else _quality(result),
+            state=TrackingState.OK if result is None else result.state,
+            overlap_section_id=-1 if result is None else result.overlap_section_id,
+            history=after.history(),
+            num_tracked=num_tracked,
+            read_s=read_s,
+            track_s=track_s,
         )
+        self._poses.publish(pose)
         self._odometry.publish(self._odometry_of(frame, T_world_camera, covariance, result, before))
         if result is not None and result.state is not TrackingState.OK:
             self._link.count(f"poses.{result.state.value}")
+        return pose
+
+    def repeat(self, pose: TrackedPose) -> None:
+        """Publish a pose once more for the mapper, which may have missed it."""
+        self._poses.publish(pose)
+        self._link.count("poses.repeated")
 
     def _odometry_of(
         self,

@@ -24,6 +24,7 @@ from vtslam.services.tracker.masks import mean_depth_m
 from vtslam.services.tracker.pose_publisher import PosePublisher, committed_state
 from vtslam.services.tracker.priors import told_prior
 from vtslam.services.tracker.state import TrackerState, TrackResult, untracked_pose
+from vtslam.services.tracker.untaken_poses import UntakenPoses
 
 
 class TrackerService:
@@ -61,7 +62,7 @@ class TrackerService:
         self._ring: FrameRingReader | None = None
         self._descriptors = Descriptors(bus, link)
         self._commits = bus.subscriber(MAPPER_COMMITTED)
-        self._poses = PosePublisher(bus, link)
+        self._poses, self._untaken = PosePublisher(bus, link), UntakenPoses(bus.clock)
         self._proposed = -1  # the last frame a pose was published of
         self._proposed_head = False  # whether it was a head
         self._ahead = TrackerState()  # what is remembered after it
@@ -82,6 +83,9 @@ class TrackerService:
                 give_back_free_memory()
             self._link.tell(ServiceState.WORKING, self._proposed)
             return 0.0
+        repeated = self._untaken.to_repeat(self._follower.num_frames)
+        if repeated is not None:
+            self._poses.repeat(repeated)
         self._link.tell(ServiceState.READY, self._proposed)
         return HEARTBEAT_S
 
@@ -105,7 +109,7 @@ class TrackerService:
                 frame, self._follower.map, state, section_id=section_id, is_head=row == 0, prior=prior
             )
         self._ahead = self._after(frame, state, result, section_id)
-        self._poses.publish(
+        pose = self._poses.publish(
             frame,
             descriptor,
             result,
@@ -117,6 +121,7 @@ class TrackerService:
             read_s=self._descriptors.read_s(frame_id),
             track_s=1e-9 * (self._clock.monotonic_ns() - start_ns),
         )
+        self._untaken.add(pose)
         self._link.count("frames.tracked")
         self._proposed, self._proposed_head = frame_id, row == 0
         return True

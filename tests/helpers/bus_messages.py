@@ -92,7 +92,7 @@ def _pixels(rng: np.random.Generator) -> Message:
     return FramePixels(
         stream="cam-0",
         frame_id=_id(rng),
-        capture_time_ns=_id(rng),
+        capture_time_ns=_id(rng) >> 1,
         depth_scale_m=float(rng.uniform(1e-4, 1.0)),
         camera=Camera(width=width, height=height, fx=120.0, fy=121.5, cx=width / 2, cy=height / 2),
         rgb=rng.integers(0, 256, (height, width, 3), np.uint8),
@@ -120,7 +120,7 @@ def _quality(rng: np.random.Generator) -> TrackingQuality:
     )
 
 
-def _tracked(rng: np.random.Generator) -> Message:
+def tracked_pose(rng: np.random.Generator) -> TrackedPose:
     return TrackedPose(
         frame_id=_id(rng),
         capture_time_ns=_id(rng),
@@ -231,7 +231,7 @@ RANDOM: dict[type[Message], Callable[[np.random.Generator], Message]] = {
     FrameDescriptor: _descriptor,
     FramePixels: _pixels,
     Credit: _credit,
-    TrackedPose: _tracked,
+    TrackedPose: tracked_pose,
     Odometry: _odometry,
     FrameCommitted: _committed,
     SectionSealed: _sealed,

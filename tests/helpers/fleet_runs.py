@@ -133,8 +133,8 @@ class Disturbance:
                 self.signals.remove(wanted)
 
 
-class CutOff(Exception):
-    """Stands for the end of the process."""
+class CutOff(BaseException):
+    """Stands for the end of the process, which nothing is done about."""
 
 
 def cut_off_at(frame_id: int) -> Callable[[FrameFacts], None]:

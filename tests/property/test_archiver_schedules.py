@@ -6,6 +6,7 @@ import pytest
 from helpers.fleet_world import Archiving, Stream, expected, fleet_world, run_world, settings_of
 
 from vtslam.common.bus_schedule import Kills, ScriptedSchedule, SeededKills, SeededSchedule
+from vtslam.services.mapper.service import MapperService
 
 _FRAMES, _FEW = 15, 11
 _SETTINGS = settings_of(2, "mapper.keep_moments=false", "tracker.overlap.max_sections=5", "storage.codec='dense'")
@@ -52,6 +53,20 @@ def test_sections_leave_and_come_back() -> None:
         assert fleet.count("archiver", "sections.packed") > 0
         assert fleet.degraded == {}
         assert fleet.events() == []
+
+
+def test_the_mapper_hears_of_archived_sections_also_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, unread = MapperService.step, []
+
+    def step(mapper: MapperService) -> float | None:
+        patience_s = real(mapper)
+        unread.append(mapper._archived.waiting)
+        return patience_s
+
+    monkeypatch.setattr(MapperService, "step", step)
+    result, _ = run_world(ScriptedSchedule(), stream=_stream(Archiving(budget_bytes=1 << 30)))
+    assert result == expected(_SETTINGS, _FRAMES)
+    assert max(unread) == 0
 
 
 @pytest.mark.parametrize("points", [_WRITING, *({point} for point in sorted(_LOADING))])

@@ -4,9 +4,11 @@ import pytest
 from helpers.fleet_world import FRAMES, SETTINGS, FewFrames, Stream, expected, fleet_world, in_one_process, run_world
 
 from vtslam.common.bus_schedule import KillAt, ScriptedSchedule, SeededKills, SeededSchedule
+from vtslam.common.messages import TrackedPose
 from vtslam.common.shm.errors import SharedMemoryFull
 from vtslam.services.commit_facts import CommitFacts
 from vtslam.services.frame_journal import JournalWriter
+from vtslam.services.mapper.pose_intake import EveryPose
 
 _SERVICES = ("sensor", "tracker", "mapper")
 _SEEDS = 60
@@ -32,6 +34,23 @@ def test_a_journal_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch) -
     result, _ = run_world(ScriptedSchedule())
     assert refused == list(range(2, FRAMES))
     assert result == expected()
+
+
+def test_a_pose_that_gets_lost_is_said_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, lost = EveryPose.take, []
+
+    def take(intake: EveryPose, num_frames: int) -> TrackedPose | None:
+        pose = real(intake, num_frames)
+        if pose is None or pose.frame_id in lost:
+            return pose
+        lost.append(pose.frame_id)
+        return None
+
+    monkeypatch.setattr(EveryPose, "take", take)
+    with fleet_world(ScriptedSchedule()) as fleet:
+        assert fleet.run() == expected()
+        assert lost == list(range(FRAMES))
+        assert fleet.count("tracker", "frames.tracked") == fleet.count("tracker", "poses.repeated") == FRAMES
 
 
 @pytest.mark.parametrize("name", _SERVICES)

@@ -15,6 +15,7 @@ from helpers.shared_data import shared_data
 
 from vtslam.common.config import ConfigError
 from vtslam.common.trajectory_io import read_trajectory
+from vtslam.services.frame_facts import FrameFacts
 from vtslam.services.process_facts import is_gone
 from vtslam.services.run_plan import plan_resume, plan_run
 from vtslam.services.sensor.sources.base import SourceError
@@ -170,6 +171,19 @@ def test_deaths_within_writes_to_the_run_folder_change_nothing(small: SmallRecor
     assert len(told) == len(points)
 
 
+def test_processes_that_are_asked_to_end_by_others_than_their_supervisor_do_not(
+    small: SmallRecording, tmp_path: Path
+) -> None:
+    names = ("sensor", "tracker", "mapper", "archiver")
+    asked = [(frames, name, number) for frames, number in ((3, signal.SIGTERM), (4, signal.SIGINT)) for name in names]
+    calm = Disturbance(signals=asked)
+    fleet_run(small.files, tmp_path / "run", calm)
+
+    assert result_bytes(tmp_path / "run") == small.undisturbed
+    assert calm.signals == []
+    assert calm.events == []
+
+
 def test_all_processes_killed_at_once_change_nothing(small: SmallRecording, tmp_path: Path) -> None:
     killed = Disturbance(signals=[(SECTION, name, KILL) for name in ("sensor", "tracker", "mapper", "archiver")])
     fleet_run(small.files, tmp_path / "run", killed)
@@ -206,6 +220,27 @@ def test_a_process_that_cannot_live_ends_the_fleet_which_may_go_on_later(small: 
     assert leftovers() == []
     plan_resume(tmp_path / "run").resume(tmp_path / "run")
     assert result_bytes(tmp_path / "run") == small.undisturbed
+
+
+def test_an_error_of_the_supervisor_loses_nothing_that_was_finished(small: SmallRecording, tmp_path: Path) -> None:
+    stopped = Disturbance(signals=[(1, "archiver", signal.SIGSTOP)])
+    calm = stopped.hooks()
+
+    def fail(facts: FrameFacts) -> None:
+        calm.on_frame(facts)
+        if facts.frame_id == SECTION + 1:
+            raise OSError("no room for anything")
+
+    with pytest.raises(OSError, match="no room for anything"):
+        small_plan(small.files).execute_in_fleet(tmp_path / "run", replace(calm, on_frame=fail))
+
+    with RunFolder.open(tmp_path / "run") as run:
+        assert run.section_ids() == [0]
+        assert run.catalog.num_frames >= SECTION + 2
+        assert not run.read_info().facts.finished
+    assert result_bytes(tmp_path / "run")["000000.vts"] == small.undisturbed["000000.vts"]
+    assert all(is_gone(pid) for pid in stopped.pids)
+    assert leftovers() == []
 
 
 def test_what_was_done_before_a_stop_is_kept_and_its_short_section_mapped_again(

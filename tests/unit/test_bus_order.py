@@ -39,8 +39,13 @@ class _Reader:
                 )
                 self.arrivals.take(received, self.keep)
 
-    def told(self, oldest: int, newest: int) -> int:
-        return self.arrivals.told(oldest, newest, 0, self.keep)
+    def told(self, oldest: int, newest: int, *, at_s: float = 0.0) -> int:
+        return self.arrivals.told(oldest, newest, int(at_s * SECOND_NS), self.keep)
+
+    def first_question_s(self, from_s: float, to_s: float) -> float | None:
+        """When it asks, looked at every 50 ms."""
+        times = (from_s + 0.05 * step for step in range(round((to_s - from_s) / 0.05)))
+        return next((time_s for time_s in times if self.asked(time_s) is not None), None)
 
     def asked(self, at_s: float) -> tuple[int, int] | None:
         gap = self.arrivals.to_ask_for(1, int(at_s * SECOND_NS))
@@ -92,7 +97,7 @@ def test_a_distant_claim_costs_nothing() -> None:
     assert reader.read == [0, 2]
 
 
-def test_after_a_quiet_moment_the_publisher_is_asked_for_more_once() -> None:
+def test_after_a_quiet_moment_the_publisher_is_asked_for_more() -> None:
     reader = _Reader()
     reader.take(0)
     assert reader.asked(0.1) is None
@@ -101,21 +106,63 @@ def test_after_a_quiet_moment_the_publisher_is_asked_for_more_once() -> None:
     assert reader.arrivals.lacks
     reader.take(1, at_s=0.4)
     assert reader.asked(0.7) == (2, MAX_AGAIN + 1)
-    assert reader.told(0, 1) == 0
+    assert reader.told(0, 1, at_s=0.7) == 0
     assert not reader.arrivals.lacks
-    assert reader.asked(100.0) is None
+    assert reader.asked(1.0) is None
+
+
+def test_an_answer_does_not_hold_for_ever() -> None:
+    reader, now_s, pauses_s = _Reader(), 0.0, []
+    reader.take(0)
+    for _ in range(9):
+        asked_s = reader.first_question_s(now_s, now_s + 30.0)
+        assert asked_s is not None
+        pauses_s.append(round(asked_s - now_s, 2))
+        now_s = asked_s
+        reader.told(0, 0, at_s=now_s)
+    assert pauses_s == [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0, 10.0, 10.0]
+    reader.told(0, 1, at_s=now_s)  # another one, which got lost
+    assert reader.asked(now_s + 10.0) == (1, MAX_AGAIN)
+    reader.take(1, at_s=now_s + 10.0)
+    assert reader.asked(now_s + 10.2) == (2, MAX_AGAIN + 1)
+
+
+def test_whoever_was_busy_for_long_asks_before_it_gives_up() -> None:
+    reader = _Reader()
+    reader.take(0)
+    assert reader.asked(60.0) == (1, MAX_AGAIN)
+    assert reader.arrivals.lacks
+    with_gap = _Reader()
+    with_gap.take(0, 2)
+    assert not with_gap.arrivals.is_hopeless(60 * SECOND_NS, room=8)
+    assert with_gap.asked(60.0) == (1, 1)
+    assert not with_gap.arrivals.is_hopeless(64 * SECOND_NS, room=8)
+    assert with_gap.arrivals.is_hopeless(66 * SECOND_NS, room=8)
+
+
+def test_a_gap_has_its_own_patience() -> None:
+    reader = _Reader()
+    reader.take(0)
+    assert reader.asked(1.0) == (1, MAX_AGAIN)
+    reader.take(2, at_s=5.9)
+    assert not reader.arrivals.is_hopeless(7 * SECOND_NS, room=8)
+    assert reader.asked(7.0) == (1, 1)
 
 
 def test_a_publisher_that_is_gone_is_not_waited_for() -> None:
     reader = _Reader()
     reader.take(0, 2)
-    assert not reader.arrivals.is_hopeless(SECOND_NS, room=8)
-    assert reader.arrivals.is_hopeless(6 * SECOND_NS, room=8)
+    assert reader.asked(1.0) == (1, 1)
+    assert not reader.arrivals.is_hopeless(5 * SECOND_NS, room=8)
+    assert reader.arrivals.is_hopeless(7 * SECOND_NS, room=8)
     assert reader.arrivals.is_hopeless(SECOND_NS, room=0)
-    assert reader.arrivals.skip_gap(6 * SECOND_NS, reader.keep) == 1
+    assert reader.arrivals.skip_gap(7 * SECOND_NS, reader.keep) == 1
     assert reader.read == [0, 2]
-    assert reader.asked(20.0) is None
+    assert reader.asked(8.0) == (3, MAX_AGAIN + 2)
+    assert reader.arrivals.lacks
+    assert reader.asked(13.1) is None
     assert not reader.arrivals.lacks
+    assert reader.first_question_s(13.2, 60.0) == pytest.approx(33.1, abs=0.06)  # it may have been busy
 
 
 @pytest.mark.parametrize("seed", range(50))

@@ -1,49 +1,34 @@
 """When a supervisor takes a process for dead, hung or hopeless; without any process."""
 
-import subprocess
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers.fake_processes import FakePopen, fake_processes
 
 from vtslam.common.fleet_folder import FleetFolder
 from vtslam.common.messages import ServiceState, ServiceStatus
 from vtslam.services.supervisor.child import REFUSED
 from vtslam.services.supervisor.child_process import ChildProcess
 from vtslam.services.supervisor.errors import FleetError, ProcessRefused
-from vtslam.services.supervisor.processes import MAPPER
+from vtslam.services.supervisor.processes import MAPPER, SENSOR, Process
 
 HANG_S = 50.0
 
 
-class FakePopen:
-    """A process that ends when it is killed, or told to."""
-
-    started = 0
-    pid = 4711
-
-    def __init__(self, *args: object, **options: object) -> None:
-        FakePopen.started += 1
-        self.code: int | None = None
-
-    def poll(self) -> int | None:
-        return self.code
-
-    def kill(self) -> None:
-        self.code = -9
-
-    def wait(self) -> int | None:
-        return self.code
-
-
 @pytest.fixture
-def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ChildProcess]:
-    monkeypatch.setattr(subprocess, "Popen", FakePopen)
-    FakePopen.started = 0
-    child = ChildProcess(MAPPER, fleet="a", folder=FleetFolder.create("a", base=tmp_path), hang_s=HANG_S)
-    child.start(0.0, {})
-    yield child
-    child.kill()
+def child(tmp_path: Path) -> Iterator[ChildProcess]:
+    with fake_processes():
+        yield started(MAPPER, tmp_path)
+
+
+def started(process: Process, base: Path) -> ChildProcess:
+    folder = FleetFolder.create("a", base=base)
+    folder.reserve_last_words(process.name)
+    child = ChildProcess(process, fleet="a", folder=folder, hang_s=HANG_S)
+    child.start(0.0, 0, {})
+    return child
 
 
 def heartbeat(epoch: int) -> ServiceStatus:
@@ -56,13 +41,40 @@ def end(child: ChildProcess, code: int) -> None:
     process.code = code
 
 
-def test_a_process_that_ends_well_is_not_started_again(child: ChildProcess) -> None:
+def test_a_process_that_ends_as_it_was_told_is_not_started_again(child: ChildProcess) -> None:
     assert child.reap(1.0, 0) is None
+    child.is_told_to_end = True
     end(child, 0)
     assert child.reap(2.0, 0) is None
     assert child.finished
     assert child.is_ready
     assert not child.is_due(99.0)
+
+
+def test_a_process_that_ends_without_being_told_to_is_started_again(child: ChildProcess) -> None:
+    child._folder.write_counts("mapper", 1, {})
+    end(child, 0)
+    assert child.reap(1.0, 3) == "mapper: ended without being told to after 3 frames; started again"
+    child.is_told_to_end = True
+    child.start(2.0, 0, {})
+    end(child, 0)
+    assert child.reap(3.0, 3) is not None, "the order was for the one before"
+
+
+def test_a_sensor_ends_itself_when_it_says_that_its_recording_has_ended(child: ChildProcess, tmp_path: Path) -> None:
+    sensor = started(SENSOR, tmp_path)
+    end(sensor, 0)
+    assert sensor.reap(1.0, 3) == "sensor: ended without being told to after 3 frames; started again"
+    sensor._folder.write_counts("sensor", 1, {"frames.published": 4})
+    sensor.start(2.0, 0, {})
+    end(sensor, 0)
+    assert sensor.reap(3.0, 3) is not None, "that was the one before"
+    sensor.start(4.0, 0, {})
+    sensor._folder.write_counts("sensor", 3, {"frames.published": 5})
+    end(sensor, 0)
+    assert sensor.reap(5.0, 5) is None
+    assert sensor.finished
+    assert sensor.counters == {"frames.published": 5}
 
 
 def test_the_wait_before_a_start_grows_and_a_commit_ends_that(child: ChildProcess) -> None:
@@ -71,7 +83,7 @@ def test_the_wait_before_a_start_grows_and_a_commit_ends_that(child: ChildProces
         end(child, 1)
         assert child.reap(10.0, frames) == f"mapper: ended with status 1 after {frames} frames; started again"
         waits.append(next(wait_s for wait_s in (0.0, 0.2, 0.5, 1.0, 2.0) if child.is_due(10.0 + wait_s)))
-        child.start(20.0, {})
+        child.start(20.0, 0, {})
     assert waits == [0.0, 0.2, 0.5, 0.0]
     assert (child.deaths, child.epoch, FakePopen.started) == (4, 5, 5)
 
@@ -80,14 +92,26 @@ def test_many_deaths_without_a_commit_are_the_end(child: ChildProcess) -> None:
     for _ in range(5):
         end(child, -11)
         child.reap(1.0, 7)
-        child.start(9.0, {})
+        child.start(9.0, 0, {})
     end(child, -11)
     with pytest.raises(FleetError, match="mapper: killed by signal 11 after 7 frames, for the 6th time"):
         child.reap(10.0, 7)
 
 
+def test_a_start_that_the_system_refuses_is_a_death(child: ChildProcess) -> None:
+    end(child, 1)
+    child.reap(1.0, 7)
+    FakePopen.refused = OSError(errno.EAGAIN, "Resource temporarily unavailable")
+    refusal = "mapper: could not be started: Resource temporarily unavailable after 7 frames"
+    assert child.start(1.0, 7, {}) == f"{refusal}; started again"
+    assert not child.is_due(1.1)
+    assert child.is_due(1.3)
+    FakePopen.refused = None
+    assert child.start(1.3, 7, {}) is None
+    assert (child.deaths, child.epoch, child.pid) == (2, 3, FakePopen.pid)
+
+
 def test_a_process_that_says_that_it_is_of_no_use_is_believed(child: ChildProcess) -> None:
-    child._folder.reserve_failure("mapper")
     child._folder.write_failure("mapper", "no room for a section")
     end(child, REFUSED)
     with pytest.raises(ProcessRefused, match="no room for a section"):

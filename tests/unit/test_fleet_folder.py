@@ -147,7 +147,7 @@ def test_ring_frames_survive_as_published(tmp_path: Path) -> None:
 
 def test_word_of_a_failure_fits_into_the_room_reserved_for_it(tmp_path: Path) -> None:
     folder = FleetFolder.create("one", base=tmp_path)
-    folder.reserve_failure("mapper")
+    folder.reserve_last_words("mapper")
     assert folder.failure("mapper") == folder.failure("tracker") == ""
     size = (folder.path / "failed-mapper").stat().st_blocks
     folder.write_failure("mapper", "a" * 10_000)
@@ -155,4 +155,19 @@ def test_word_of_a_failure_fits_into_the_room_reserved_for_it(tmp_path: Path) ->
     folder.write_failure("mapper", "no room: ä")
     assert folder.failure("mapper") == "no room: ä"
     assert (folder.path / "failed-mapper").stat().st_blocks == size > 0
+    folder.remove()
+
+
+def test_counts_fit_into_the_room_reserved_for_them_and_are_those_of_one_start(tmp_path: Path) -> None:
+    folder = FleetFolder.create("one", base=tmp_path)
+    folder.reserve_last_words("mapper")
+    assert folder.counts("mapper", 1) is None
+    path, most = folder.path / "ended-mapper", {f"{number:064d}": 2**63 - 1 for number in range(64)}
+    blocks = path.stat().st_blocks
+    folder.write_counts("mapper", 1, most)
+    assert folder.counts("mapper", 1) == most
+    folder.write_counts("mapper", 2, {"frames": 3})
+    assert folder.counts("mapper", 2) == {"frames": 3}
+    assert folder.counts("mapper", 1) is None
+    assert path.stat().st_blocks == blocks > 0
     folder.remove()

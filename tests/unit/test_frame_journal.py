@@ -59,7 +59,7 @@ def test_lines_are_read_once_and_in_order_over_many_sections(folder: Path) -> No
     append(writer, 0, 1)
     assert new_ids(reader) == [0, 1]
     append(writer, 2, 3, 4, 5, 6, 7)
-    lines = reader.new_lines()
+    lines = list(reader.new_lines())
     assert [line.frame.facts.frame_id for line in lines] == [2, 3, 4, 5, 6, 7]
     assert [line.ended is not None for line in lines] == [True, False, False, True, False, False]
     ended = lines[3].ended
@@ -80,6 +80,20 @@ def test_a_line_that_was_cut_is_written_anew(folder: Path) -> None:
     append(writer, 1, 2)
     assert new_ids(reader) == [1, 2]
     writer.close()
+
+
+def test_what_lies_before_a_damaged_line_is_read_once_and_the_damage_told_each_time(folder: Path) -> None:
+    writer, reader = JournalWriter(folder), JournalReader(folder)
+    append(writer, 0, 1, 2, 3)
+    writer.close()
+    path = folder / "000000"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(lines[0] + b"\0\n" + lines[2])
+    read: list[int] = []
+    for _ in range(2):
+        with pytest.raises(ValueError, match="Expecting value"):
+            read.extend(line.frame.facts.frame_id for line in reader.new_lines())
+    assert read == [0]
 
 
 def test_a_line_that_does_not_fit_leaves_nothing_and_can_be_tried_again(

@@ -36,6 +36,17 @@ def _control(path: Path) -> ControlPage:
     return ControlPage.open(path, open_file(path, writable=True), Kind.RING)
 
 
+def test_what_dead_writers_reserved_and_never_finished_is_given_back(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vtslam.common.shm.frame_ring.is_alive", lambda identity: identity == 0x7A)
+    stay = {".new-7a-ring", ".new-owner", ".new-7b-another", "other"}
+    for name in (*stay, ".new-7b-ring"):
+        (path.parent / name).write_bytes(b"reserved")
+    FrameRingWriter.create(path, _SPEC)
+    assert {each.name for each in path.parent.iterdir()} == stay | {"ring"}
+
+
 def test_a_frame_comes_out_as_it_went_in_and_cannot_be_changed(path: Path, writer: FrameRingWriter) -> None:
     reader = FrameRingReader(path)
     assert reader.newest() is None
