@@ -73,10 +73,10 @@ def test_curves_show_what_more_steps_are_worth(tmp_path: Path) -> None:
 
 
 def test_a_drive_through_town_tells_what_grows(tmp_path: Path) -> None:
-    words = ["--frames", "10", "--size", "80x24", "--budget-mb", "2", "--pose-prior", "0.3,0.5"]
+    words = ["--frames", "10", "--size", "80x24", "--budget-mb", "3", "--pose-prior", "0.3,0.5"]
     values = bench("city", *words, "--set", "section.length=2", result=tmp_path / "city.json")
     assert (values["frames"], values["sections"], values["lost"]) == (10, 5, 0)
-    assert 0 < values["shm_peak_mb"] <= 2.0
+    assert 0 < values["shm_peak_mb"] <= 3.0
     assert min(values[key] for key in ("map_mb", "map_disk_mb", "recording_mb", "disk_mb_per_s")) > 0
     # On a busy machine all frames may lie between two looks at the fleet, so that growth is not known.
     assert set(values["rss_growth_by_process"]) == {"sensor", "tracker", "mapper", "archiver", "supervisor"}
