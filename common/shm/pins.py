@@ -23,13 +23,13 @@ class PinTable:
 
     def claim(self) -> int:
         """An entry for this process; raises NoFreePin if living processes hold all of them."""
-        for _ in range(2):
+        while True:
             for entry in self._entries:
                 if self._words.compare_exchange(entry, 0, own_identity()):
                     return entry
-            if not self.reap():
-                break
-        raise NoFreePin(f"all {len(self)} pins are held, by processes {', '.join(map(str, self.holder_pids()))}")
+            # Others reap and release meanwhile: the table is full only if it still is when nobody in it is dead.
+            if not self.reap() and len(holders := self.holder_pids()) == len(self):
+                raise NoFreePin(f"all {len(self)} pins are held, by processes {', '.join(map(str, holders))}")
 
     def pin(self, entry: int, value: int) -> None:
         """Pin ``value`` with a claimed entry."""
