@@ -279,7 +279,8 @@ class FleetSettings:
             recordings, realtime for what publishers send.
         lead: Frames that tracking is ahead of mapping when pipelined.
         replay_hz: Frames per second of a recording in realtime; 0 as they were captured.
-        tracker_threads, mapper_threads: Threads of these processes; 0 as splat.threads.
+        tracker_threads, mapper_threads: Threads of these processes; 0 as splat.threads, and half the cores each in
+            realtime.
         map_budget_mb: Shared memory for the map, 10^6 bytes; finished sections leave it for the run folder as needed,
             and a section ends early before it is too large to be mapped in it.
         hang_s: A process whose work loop is silent for so long is killed and started again; more than any step takes.

@@ -4,7 +4,7 @@ import os
 from dataclasses import replace
 
 from vtslam.common.config import ConfigError
-from vtslam.common.settings import SplatSettings
+from vtslam.common.settings import Settings, SplatSettings
 from vtslam.common.splat.engine import Engine, RasterSettings
 from vtslam.services.process_facts import package_version
 
@@ -17,6 +17,20 @@ def thread_count(settings: SplatSettings) -> int:
 def with_threads(settings: SplatSettings, threads: int) -> SplatSettings:
     """The settings with that many threads; 0 leaves them as they are."""
     return replace(settings, threads=threads or settings.threads)
+
+
+def fleet_threads(settings: Settings, own: int, *, is_realtime: bool) -> int:
+    """Threads of the tracker or the mapper of a fleet.
+
+    Args:
+        settings: The effective settings.
+        own: What they say of this process.
+        is_realtime: Both work all the time: unless threads are set, they share the cores out. More threads than cores
+            would finish nothing sooner, and whoever else has something to say would wait for all of them.
+    """
+    if own or not is_realtime or settings.splat.threads:
+        return own
+    return max(thread_count(settings.splat) // 2, 1)
 
 
 def make_engine(settings: SplatSettings) -> Engine:

@@ -144,7 +144,7 @@ def _sensor(parts: _Parts) -> "Steps":
 
 
 def _tracker(parts: _Parts) -> "Steps":
-    from vtslam.services.engines import make_engine, thread_count, with_threads
+    from vtslam.services.engines import fleet_threads, make_engine, thread_count, with_threads
     from vtslam.services.map_follower import MapFollower
     from vtslam.services.supervisor.store import map_store
     from vtslam.services.tracker.core import Tracker
@@ -157,7 +157,8 @@ def _tracker(parts: _Parts) -> "Steps":
         _archive(parts, store),
         candidate_interval=settings.section.candidate_interval,
     )
-    splat = with_threads(settings.splat, settings.fleet.tracker_threads)
+    threads = fleet_threads(settings, settings.fleet.tracker_threads, is_realtime=parts.pace.is_realtime)
+    splat = with_threads(settings.splat, threads)
     core = Tracker(settings=settings.tracker, engine=make_engine(splat), threads=thread_count(splat))
     bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
     if pace.is_realtime:
@@ -166,16 +167,17 @@ def _tracker(parts: _Parts) -> "Steps":
 
 
 def _mapper(parts: _Parts) -> "Steps":
-    from vtslam.services.engines import make_engine, with_threads
+    from vtslam.services.engines import fleet_threads, make_engine, with_threads
     from vtslam.services.mapper.service import FleetPaths, MapperService
     from vtslam.services.supervisor.store import map_store
 
-    store = map_store(parts.folder, parts.settings)
+    store, settings = map_store(parts.folder, parts.settings), parts.settings
+    threads = fleet_threads(settings, settings.fleet.mapper_threads, is_realtime=parts.pace.is_realtime)
     return MapperService(
         parts.bus,
         parts.link,
-        parts.settings,
-        make_engine(with_threads(parts.settings.splat, parts.settings.fleet.mapper_threads)),
+        settings,
+        make_engine(with_threads(settings.splat, threads)),
         store,
         _archive(parts, store),
         FleetPaths(ring=parts.folder.ring_path, journal=parts.folder.journal_path),

@@ -15,6 +15,8 @@ _FRAMES = 1024  # frames remembered
 class Descriptors:
     """Listens to the sensor, and keeps latencies of its messages in the service's gauges.
 
+    Start-up, when all processes load what they need, is left out of the gauges.
+
     Args:
         bus: The tracker's session.
         link: What it says of itself.
@@ -23,17 +25,19 @@ class Descriptors:
     def __init__(self, bus: Bus, link: ServiceLink) -> None:
         self._clock, self._link = bus.clock, link
         self._subscriber = bus.subscriber(SENSOR_FRAME)
-        self._start_ns = bus.clock.wall_ns()
+        self._start_ns: int | None = None  # when start-up was over
         self._heard: dict[int, tuple[float, int]] = {}  # by frame: reading time, and when it was published
         self._latencies_ms: deque[float] = deque(maxlen=_SAMPLES)
 
-    def listen(self) -> None:
-        """Take in what has come."""
+    def listen(self, *, started: bool) -> None:
+        """Take in what has come; ``started`` once a frame was committed."""
+        if started and self._start_ns is None:
+            self._start_ns = self._clock.wall_ns()
         to_wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         heard = False
         while (frame := self._subscriber.receive()) is not None:
             self._heard[frame.message.frame_id] = frame.message.read_s, frame.publish_time_ns
-            if frame.publish_time_ns >= self._start_ns:  # others were kept for a tracker that was not there yet
+            if self._start_ns is not None and frame.publish_time_ns >= self._start_ns:
                 self._latencies_ms.append(1e-6 * (frame.arrival_time_ns + to_wall_ns - frame.publish_time_ns))
                 heard = True
         while len(self._heard) > _FRAMES:

@@ -70,7 +70,7 @@ class RealtimeTracker:
     def step(self) -> float | None:
         """See `Steps`."""
         self._link.poll()
-        self._descriptors.listen()
+        self._descriptors.listen(started=self._follower.num_frames > 0)
         while self._commits.receive() is not None:
             pass  # what was committed is in the store
         if self._link.stopping:

@@ -71,7 +71,7 @@ class TrackerService:
     def step(self) -> float | None:
         """See `Steps`."""
         self._link.poll()
-        self._descriptors.listen()
+        self._descriptors.listen(started=self._follower.num_frames > 0)
         while self._commits.receive() is not None:
             pass  # what was committed is in the store
         if self._link.stopping:
