@@ -1,5 +1,6 @@
 """The sensor service of a recording in realtime: frames as fast as they were captured, whoever keeps up."""
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from vtslam.common.bus import Bus
@@ -16,8 +17,9 @@ from vtslam.services.service_link import HEARTBEAT_S, ServiceLink
 class ReplaySensor:
     """Puts each frame of a source into the ring when its time comes, over the oldest one that nobody uses.
 
-    A frame that takes too long to be read comes late, and so do those after it until they have caught up. A sensor that
-    starts again goes on with the next frame.
+    The next frame is read in a thread of its own, so that whoever tells of a frame does nothing else. A frame that
+    takes too long to be read comes late, and so do those after it until they have caught up. A sensor that starts again
+    goes on with the next frame.
 
     Args:
         bus: Its session.
@@ -32,25 +34,34 @@ class ReplaySensor:
         self._frames = bus.publisher(SENSOR_FRAME)
         self._ring = FrameRingWriter.adopt(ring_path) if ring_path.exists() else make_ring(ring_path, source.camera)
         self._next = self._ring.published  # frames are numbered from 0, the ring's sequence from 1
-        self._read: tuple[Frame, float] | None = None
+        self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="read")
+        self._read = self._reading()
         self._origin: tuple[int, int] | None = None  # a frame's time by the recording, and when that was
 
     def step(self) -> float | None:
         """See `Steps`."""
         self._link.poll()
         self._link.counters["frames.published"] = self._next
-        if self._link.stopping or self._next == len(self._source):
+        if self._link.stopping or self._read is None:
+            self._reader.shutdown(cancel_futures=True)
             self._link.tell(ServiceState.FINISHED, self._next - 1)
             return None
         self._link.tell(ServiceState.WORKING, self._next - 1)
-        frame, read_s = self._read = self._read or timed(self._source, self._next)
+        frame, read_s = self._read.result()
         left_s = self._left_s(frame)
         if left_s > 0.0:
             return min(left_s, HEARTBEAT_S)
         descriptor = self._ring.publish_newest(frame)
         self._frames.publish(descriptor_message(frame, descriptor, epoch=self._link.epoch, read_s=read_s))
-        self._next, self._read = self._next + 1, None
+        self._next += 1
+        self._read = self._reading()
         return 0.0
+
+    def _reading(self) -> Future[tuple[Frame, float]] | None:
+        """The next frame, and the seconds that reading it took; None after the last."""
+        if self._next >= len(self._source):
+            return None
+        return self._reader.submit(timed, self._source, self._next)
 
     def _left_s(self, frame: Frame) -> float:
         """Seconds until the frame's time."""

@@ -124,6 +124,7 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
 
 
 def _sensor(parts: _Parts) -> "Steps":
+    from vtslam.common.scheduling import answer_at_once
     from vtslam.services.sensor.live import LiveSensor
     from vtslam.services.sensor.replay import ReplaySensor
     from vtslam.services.sensor.service import RecordingSensor
@@ -136,7 +137,9 @@ def _sensor(parts: _Parts) -> "Steps":
         return LiveSensor(bus, link, ring_path, credit=credit, is_recorded=is_recorded)
     source = open_source(parts.source)
     if pace.is_realtime:
-        return ReplaySensor(bus, link, source, ring_path, rate_hz=pace.replay_hz)
+        sensor = ReplaySensor(bus, link, source, ring_path, rate_hz=pace.replay_hz)
+        answer_at_once()  # as a camera's driver would; the thread that reads has started
+        return sensor
     durable = parts.run.catalog.num_frames  # when the sensor starts for the first time, these are all
     return RecordingSensor(
         bus, link, source, ring_path, credit=pace.credit, frames_before=durable, is_recorded=is_recorded

@@ -9,7 +9,7 @@ import pytest
 
 from vtslam.common.bus import Member
 from vtslam.common.bus_zenoh import Hub, join
-from vtslam.common.scheduling import threads_that_answer_at_once
+from vtslam.common.scheduling import answer_at_once, threads_that_answer_at_once
 from vtslam.common.topics import Role
 
 SHORTEST_NS = 100_000
@@ -79,3 +79,17 @@ def test_all_threads_of_sessions_on_the_bus_answer_at_once(tmp_path: Path) -> No
         zenohs = {thread for thread, name in names.items() if re.fullmatch(r"(app|acc|net|rx|tx)-\d+\n", name)}
         assert len(zenohs) >= 3
         assert {each for thread, each in slices_ns().items() if thread in zenohs} == {SHORTEST_NS}
+
+
+def test_a_thread_may_answer_at_once_from_now_on() -> None:
+    found: list[int] = []
+
+    def now_on() -> None:
+        answer_at_once()
+        found.extend((own_slice_ns(), slice_of_new_thread_ns()))
+
+    thread = threading.Thread(target=now_on)
+    thread.start()
+    thread.join()
+    assert found == [SHORTEST_NS, SHORTEST_NS]
+    assert own_slice_ns() > SHORTEST_NS
