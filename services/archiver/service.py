@@ -192,4 +192,5 @@ class ArchiverService:
         outcome, why = self._residents.bring(section_id, self._record.num_durable, spared=self._ahead)
         if outcome is LoadOutcome.RESIDENT and not was_there:
             self._link.count("sections.reloaded")
+            give_back_free_memory()
         return outcome, why

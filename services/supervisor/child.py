@@ -203,9 +203,11 @@ def _archive(parts: _Parts, store: "MapStore") -> "StoreArchive":
 def _archiver(parts: _Parts) -> "Steps":
     from vtslam.services.archiver.service import ArchiverService
     from vtslam.services.frame_journal import JournalReader
+    from vtslam.services.free_memory import keep_large_arrays_apart
     from vtslam.services.supervisor.store import map_store
     from vtslam.storage.run_folder import RunFolder
 
+    keep_large_arrays_apart(rare=True)  # it has a section in hand when one comes or goes, and nothing between
     return ArchiverService(
         parts.bus,
         parts.link,
