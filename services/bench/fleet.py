@@ -19,6 +19,7 @@ from vtslam.services.supervisor.supervisor import Supervisor
 
 PARTS = ("ratios", "latency", "realtime")
 _LATENCY_HZ, _REALTIME_HZ = 30.0, 60.0
+_LOOK_S = 0.25  # between looks at memory, each of which takes a millisecond of the process that hands messages on
 _LATENCY_SECTION = 4  # frames: sections shall be sealed although few of such frames are mapped
 
 
@@ -126,7 +127,7 @@ class _Watched:
 
     Attributes:
         frames, sections: In the map.
-        rss_mb: Private memory of all services, at each look while all of them ran.
+        rss_mb: Private memory of all services, at looks while all of them ran.
         published: (seconds, frames published), likewise.
     """
 
@@ -138,11 +139,14 @@ class _Watched:
 
     def look(self, supervisor: Supervisor) -> None:
         self._supervisor = supervisor
+        now_s = time.perf_counter()
+        if self.published and now_s - self.published[-1][0] < _LOOK_S:
+            return
         children = supervisor.children.values()
         pids = [child.pid for child in children if child.pid is not None and child.is_ready]
         if len(pids) == len(children):
             self.rss_mb.append(sum(private_rss_mb(pid) for pid in pids))
-            self.published.append((time.perf_counter(), self.counter("sensor", "frames.published")))
+            self.published.append((now_s, self.counter("sensor", "frames.published")))
 
     def counter(self, service: str, name: str) -> int:
         return 0 if self._supervisor is None else self._supervisor.children[service].counters.get(name, 0)
