@@ -219,7 +219,11 @@ def _check_first_pose(source: Source, settings: Settings) -> None:
     """Refuse a first frame without a pose where poses are given: the world would not be that of the later ones'."""
     options = SourceUri.parse(source.uri).options
     has_poses = not options.keys().isdisjoint(POSE_OPTIONS)
-    if (settings.tracker.enabled and not has_poses) or source.frame(0).pose_prior is not None:
+    # Of a simulated or measured truth that comes with the recording the first frame is not read: rendering one takes the
+    # memory of a town, which this process would keep. Should it lack a pose, the tracker says that it ignores the rest.
+    if settings.tracker.enabled and "poses" not in options:
+        return
+    if source.frame(0).pose_prior is not None:
         return
     if not has_poses:
         raise ConfigError(f"--tracking off: {source.uri}: expected a pose for the first frame (--poses), found none")
