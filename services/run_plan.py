@@ -219,8 +219,8 @@ def _check_first_pose(source: Source, settings: Settings) -> None:
     """Refuse a first frame without a pose where poses are given: the world would not be that of the later ones'."""
     options = SourceUri.parse(source.uri).options
     has_poses = not options.keys().isdisjoint(POSE_OPTIONS)
-    # Of a simulated or measured truth that comes with the recording the first frame is not read: rendering one takes the
-    # memory of a town, which this process would keep. Should it lack a pose, the tracker says that it ignores the rest.
+    # Where poses are made from the recording's own truth the first frame is not read: to render one takes the memory
+    # of a town, which this process would keep. Should it lack a pose, the tracker says that it ignores the rest.
     if settings.tracker.enabled and "poses" not in options:
         return
     if source.frame(0).pose_prior is not None:

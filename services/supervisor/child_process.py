@@ -28,6 +28,8 @@ class ChildProcess:
         folder: The fleet's folder.
         hang_s: Silence of its work loop that is a hang.
         run_lock: Descriptor of the run folder's lock for a process that writes there; it keeps its number.
+        own_session: The kernel may share processors out among sessions first (autogroups). Processes that take turns
+            are quicker with a session each; those that work all the time answer at once only within a common one.
 
     Attributes:
         epoch: How often it was started.
@@ -39,10 +41,18 @@ class ChildProcess:
     """
 
     def __init__(
-        self, process: Process, *, fleet: str, folder: FleetFolder, hang_s: float, run_lock: int | None = None
+        self,
+        process: Process,
+        *,
+        fleet: str,
+        folder: FleetFolder,
+        hang_s: float,
+        run_lock: int | None = None,
+        own_session: bool = True,
     ) -> None:
         self.process, self._fleet, self._folder, self._hang_s = process, fleet, folder, hang_s
         self._handed_down = () if run_lock is None else (run_lock,)
+        self._own_session = own_session
         self.epoch = self.deaths = self.hangs = 0
         self.status: ServiceStatus | None = None
         self.finished = self.is_told_to_end = False
@@ -101,9 +111,9 @@ class ChildProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=self._handed_down,
-                # Ctrl-C in a terminal is for the supervisor. Not a session each: the kernel may share processors out
-                # among sessions first (autogroups), and threads that answer at once would do so only within their own.
-                process_group=0,
+                # Ctrl-C in a terminal is for the supervisor, hence a session or a process group of its own.
+                start_new_session=self._own_session,
+                process_group=None if self._own_session else 0,
             )
         except OSError as error:  # no memory, or too many processes, for now
             return self._died(f"could not be started: {error.strerror}", now_s, frames)

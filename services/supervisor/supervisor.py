@@ -86,6 +86,7 @@ class Supervisor:
                 folder=folder,
                 hang_s=hang_s,
                 run_lock=run_lock if process.name == ARCHIVER.name else None,
+                own_session=pacing is not Pacing.REALTIME,
             )
             for process in processes
         }
