@@ -3,7 +3,7 @@
 
 set shell := ["bash", "-euo", "pipefail", "-c"]
 
-native_modules := "vtslam.common.splat._native vtslam.common.optim._align vtslam.common.shm._atomics vtslam.services.sensor.sources._raycast vtslam.services.sensor.sources._city vtslam.storage._coder"
+native_modules := "vtslam.common.splat._native vtslam.common.geometry._points vtslam.common.optim._align vtslam.common.shm._atomics vtslam.services.sensor.sources._raycast vtslam.services.sensor.sources._city vtslam.storage._coder"
 
 _default:
     @just --list

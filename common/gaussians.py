@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from vtslam.common.exposure import Exposure
 from vtslam.common.frame import Frame
+from vtslam.common.geometry import _points
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.rows import thinned
 from vtslam.common.splat.engine import Splats
@@ -111,14 +112,20 @@ class ViewTiedGaussians:
     def means_m(
         self, camera: Camera, T_section_frames: npt.NDArray[np.float64], *, depth_unit_m: float
     ) -> npt.NDArray[np.float32]:
-        """Positions float32 [N,3] (m) in the section's frame, given its frames' poses float64 [F,4,4]."""
-        points = self.points_frame_m(camera, depth_unit_m=depth_unit_m)
-        out = np.empty((self.count, 3), np.float32)
-        for index in np.unique(self.frame_index):
-            rows = self.frame_index == index
-            T = T_section_frames[index]
-            out[rows] = points[rows] @ T[:3, :3].T + T[:3, 3]
-        return out
+        """Positions float32 [N,3] (m) in the section's frame, given its frames' poses float64 [F,4,4].
+
+        Those of a Gaussian do not depend on the others, to the bit. Raises IndexError for a frame without a pose.
+        """
+        return np.asarray(
+            _points.tied_points(
+                *(np.ascontiguousarray(each) for each in (self.frame_index, self.pixel, self.subpixel, self.depth)),
+                np.ascontiguousarray(T_section_frames, np.float64),
+                SUBPIXEL_OFFSETS_PX,
+                camera.width,
+                (camera.fx, camera.fy, camera.cx, camera.cy),
+                depth_unit_m,
+            )
+        )
 
     def splats(self, means_m: npt.NDArray[np.float32]) -> Splats:
         """The Gaussians as a renderer takes them, with their positions already computed."""

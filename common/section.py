@@ -1,5 +1,6 @@
 """A section: N consecutive frames, the Gaussians tied to them, and the views that answer overlap questions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from vtslam.common.gaussians import ViewTiedGaussians
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim.surface import measured_surface
-from vtslam.common.rows import thinned
+from vtslam.common.rows import GrowingRows, thinned
 from vtslam.common.splat.engine import Splats
 
 
@@ -62,9 +63,8 @@ class Section:
 
     def retied(self) -> "Section":
         """The section with positions and surface computed anew from its frames' poses."""
-        parts = [self._surface_of(frame) for frame in self.frames]
-        surface = np.concatenate([np.zeros((0, 6), np.float32), *parts])
-        return replace(self, means_m=self._means_of(self.gaussians), surface=surface)
+        bare = replace(self, surface=np.zeros((0, 6), np.float32))
+        return replace(bare, means_m=self._means_of(self.gaussians), surface=bare._surface_with(self.frames))
 
     def grown(self, frame: SectionFrame, new: ViewTiedGaussians) -> "Section":
         """The section with one more frame and the Gaussians tied to it."""
@@ -73,31 +73,30 @@ class Section:
             longer,
             gaussians=self.gaussians.appended(new),
             means_m=np.concatenate([self.means_m, longer._means_of(new)]),
-            surface=np.concatenate([self.surface, self._surface_of(frame)]),
+            surface=self._surface_with([frame]),
         )
 
     def finished(self, last: int, view_depth: npt.NDArray[np.uint16]) -> "Section":
         """The section as it will be read back, to the bit; frame ``last`` keeps its depth, and none after it does."""
-        frames, surface = list(self.frames), self.surface
-        if frames[last].view_depth is None:
-            frames[last] = replace(frames[last], view_depth=view_depth)
-            surface = np.concatenate([surface, self._surface_of(frames[last])])
-        # Positions anew: the last bits of a product of matrices may depend on the number of rows.
-        return replace(self, frames=tuple(frames), means_m=self._means_of(self.gaussians), surface=surface)
+        if self.frames[last].view_depth is not None:
+            return self
+        frame = replace(self.frames[last], view_depth=view_depth)
+        frames = (*self.frames[:last], frame, *self.frames[last + 1 :])
+        return replace(self, frames=frames, surface=self._surface_with([frame]))
 
     def thinned(self, kept: npt.NDArray[np.bool_]) -> "Section":
         """Without those of the last Gaussians that are not ``kept`` (bool [M])."""
         return replace(self, gaussians=self.gaussians.thinned(kept), means_m=thinned(self.means_m, kept))
 
-    def continued(self, earlier: "Section") -> "Section":
-        """As :meth:`retied`, with the parts that a former state of the section already has taken from there."""
-        new_means = self._means_of(self.gaussians.rows_from(earlier.gaussians.count))
-        new_surface = [self._surface_of(frame) for frame in self.frames[len(earlier.frames) :]]
-        return replace(
-            self,
-            means_m=np.concatenate([earlier.means_m, new_means]),
-            surface=np.concatenate([earlier.surface, *new_surface]),
-        )
+    def continued(self, earlier: "Section", means_m: GrowingRows[np.float32]) -> "Section":
+        """As :meth:`retied`, with the parts that a former state of the section already has taken from there.
+
+        Args:
+            earlier: That state.
+            means_m: Its positions; those of further Gaussians are added.
+        """
+        means_m.extend(self._means_of(self.gaussians.rows_from(earlier.gaussians.count)))
+        return replace(self, means_m=means_m.values, surface=earlier._surface_with(self.frames[len(earlier.frames) :]))
 
     def with_surface_of(self, other: "Section") -> "Section":
         """The section with another one's measured surface beside its own; itself if the other one is this one."""
@@ -113,10 +112,14 @@ class Section:
         poses = np.stack([f.T_section_frame for f in self.frames])
         return gaussians.means_m(self.camera, poses, depth_unit_m=self.depth_unit_m)
 
-    def _surface_of(self, frame: SectionFrame) -> npt.NDArray[np.float32]:
-        if frame.view_depth is None:
-            return np.zeros((0, 6), np.float32)
-        return measured_surface(frame.view_depth, self.camera, frame.T_section_frame, depth_scale_m=self.depth_scale_m)
+    def _surface_with(self, frames: Sequence[SectionFrame]) -> npt.NDArray[np.float32]:
+        """The surface, and what further frames measured; the same array if that is nothing, as of most frames."""
+        parts = [
+            measured_surface(each.view_depth, self.camera, each.T_section_frame, depth_scale_m=self.depth_scale_m)
+            for each in frames
+            if each.view_depth is not None
+        ]
+        return np.concatenate([self.surface, *parts]) if parts else self.surface
 
     @property
     def depth_unit_m(self) -> float:

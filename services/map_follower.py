@@ -9,6 +9,7 @@ import numpy.typing as npt
 from vtslam.common.frame import Frame
 from vtslam.common.overlap.coarse import CoarseDepth
 from vtslam.common.overlap.view_index import ViewFacts
+from vtslam.common.rows import GrowingRows
 from vtslam.common.section import Section
 from vtslam.common.section_end import poses_in
 from vtslam.common.shm.active_reader import ActiveReader, PinnedActive
@@ -104,6 +105,7 @@ class MapFollower:
         self._held: PinnedActive | None = None
         self._seen = (-1, -1)  # section and generation of the last commit; of a sealed section, the next one and 0
         self._at = (-1, -1)  # section and generation of the map's active section
+        self._means_m: GrowingRows[np.float32] | None = None  # positions of the active section's Gaussians
 
     @property
     def num_frames(self) -> int:
@@ -148,11 +150,13 @@ class MapFollower:
             held = self._reader[1].pinned(generation)
         except (GenerationGone, SectionNotResident):
             return False
-        former = self.map.active
-        if self._at[0] == section_id and self._at[1] < generation and former is not None:
-            self.map.committed(held.state.section.continued(former))
+        former, section = self.map.active, held.state.section
+        if self._at[0] == section_id and self._at[1] < generation and former is not None and self._means_m is not None:
+            section = section.continued(former, self._means_m)
         else:
-            self.map.committed(held.state.section.retied())
+            section = section.retied()
+            self._means_m = GrowingRows(section.means_m)
+        self.map.committed(section)
         self.release()
         self._held, self._at = held, (section_id, generation)
         return True
@@ -189,6 +193,7 @@ class MapFollower:
         self.map.sealed(self._archive.read(last.section_id))
         self.facts, self.frame, self.poses = CommitFacts.unpacked(last.facts), last.frame, ()
         self.release()
+        self._means_m = None
         self._seen = self._at = last.section_id + 1, 0
 
     def release(self) -> None:

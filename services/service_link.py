@@ -8,6 +8,7 @@ from vtslam.common.topics import CONTROL, FLEET_EVENT, STATUS
 from vtslam.services.process_facts import peak_rss_mb
 
 HEARTBEAT_S = 0.5
+_IN_TURN = (ServiceState.READY, ServiceState.WORKING)  # of each other, with every frame
 
 
 class ServiceLink:
@@ -53,9 +54,12 @@ class ServiceLink:
                 self.drain_through = order.through_frame_id
 
     def tell(self, state: ServiceState, last_frame_id: int, *, detail: str = "") -> None:
-        """A heartbeat, if the last one is long ago or the state has changed."""
+        """A heartbeat, if the last one is long ago or the state has changed.
+
+        Whether there was work at that moment does not count: processes would be woken several times for each frame.
+        """
         now_ns = self._bus.clock.monotonic_ns()
-        unchanged = self._told is state
+        unchanged = self._told is state or (self._told in _IN_TURN and state in _IN_TURN)
         if unchanged and now_ns - self._told_ns < HEARTBEAT_S * 1e9:
             return
         self._told, self._told_ns = state, now_ns

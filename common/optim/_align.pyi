@@ -17,8 +17,10 @@ def visible_points(points: Annotated[NDArray[numpy.float32], dict(shape=(None, N
     Points [M,6] (position, normal; camera frame) that a rendered depth image shows.
     """
 
-def normals_from_depth(depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], camera: tuple[float, float, float, float], max_relative_step: float) -> Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')]:
-    """Unit normals [H,W,3] of a depth image (m); zero where unknown."""
+def normals_from_depth(depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], camera: tuple[float, float, float, float], max_relative_step: float, stride: int) -> Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')]:
+    """
+    Unit normals of every stride-th pixel and row of a depth image (m); zero where unknown.
+    """
 
 def tracking_loss(rgb: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], target_rgb: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], target_depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], mask: Annotated[NDArray[numpy.uint8], dict(shape=(None, None), order='C', device='cpu', writable=False)], silhouette_threshold: float, color_weight: float, depth_weight: float) -> tuple[float, float, int, Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')]]:
     """

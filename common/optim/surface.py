@@ -11,13 +11,14 @@ _STRIDE_PX = 2  # a plane fit covers 9x9 pixels: denser points say nothing new .
 _STRIDE_WIDTH_PX = 320  # ... at this image width; wider images have more pixels, not more surface
 
 
-def normals_from_depth(depth_m: npt.NDArray[np.float32], camera: Camera) -> npt.NDArray[np.float32]:
+def normals_from_depth(depth_m: npt.NDArray[np.float32], camera: Camera, *, stride: int = 1) -> npt.NDArray[np.float32]:
     """Unit normals float32 [H,W,3] (camera frame) of a depth image [H,W] (m) by plane fits over 9x9 pixels.
 
-    Zero at pixels without depth (0) and where too few neighbours lie on the same surface.
+    Zero at pixels without depth (0) and where too few neighbours lie on the same surface. With a ``stride`` only those
+    of every so-many-th pixel and row.
     """
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return np.asarray(_align.normals_from_depth(depth_m, intrinsics, _MAX_RELATIVE_DEPTH_STEP))
+    return np.asarray(_align.normals_from_depth(depth_m, intrinsics, _MAX_RELATIVE_DEPTH_STEP, stride))
 
 
 def measured_surface(
@@ -39,9 +40,8 @@ def measured_surface(
     """
     depth_m = depth.astype(np.float32) * np.float32(depth_scale_m)
     stride = max(_STRIDE_PX, round(_STRIDE_PX * camera.width / _STRIDE_WIDTH_PX))
-    part = (slice(None, None, stride), slice(None, None, stride))
-    normals = normals_from_depth(depth_m, camera)[part].reshape(-1, 3)
-    points = camera.back_projected(depth_m)[part].reshape(-1, 3)
+    normals = normals_from_depth(depth_m, camera, stride=stride).reshape(-1, 3)
+    points = (camera.pixel_rays()[::stride, ::stride] * depth_m[::stride, ::stride, None]).reshape(-1, 3)
     known = np.flatnonzero(normals.any(axis=1))
     rotation, translation = T_section_frame[:3, :3], T_section_frame[:3, 3]
     out = np.empty((known.size, 6), np.float32)

@@ -1,9 +1,10 @@
 """Reading the active section: one generation, pinned (docs/protocol-shm.md, section 5)."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -144,8 +145,8 @@ class ActiveReader:
         return ActiveState(
             generation=int(record["generation"]),
             section=section,
-            frames=tuple(self.frame(index) for index in range(len(rows))),
-            trained_rows=tuple(index for index, row in enumerate(rows) if row["flags"] & TRAINED),
+            frames=_FramesInPlace(self, len(rows)),
+            trained_rows=tuple(np.flatnonzero(rows["flags"] & TRAINED).tolist()),
             neighbour_ids=tuple(int(n) for n in record["neighbour_ids"][: int(record["num_neighbours"])]),
             moments=self._moments(record) if with_moments else None,
             facts=facts,
@@ -179,6 +180,25 @@ class ActiveReader:
             return mapped(fd, length, writable=False)
         finally:
             os.close(fd)
+
+
+class _FramesInPlace(Sequence[Frame]):
+    """The frames of the first rows; each is made when it is asked for, as most readers want the last one alone."""
+
+    def __init__(self, reader: ActiveReader, count: int) -> None:
+        self._reader, self._rows = reader, range(count)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Frame, ...]: ...
+    def __getitem__(self, index: int | slice) -> Frame | tuple[Frame, ...]:
+        if isinstance(index, slice):
+            return tuple(self._reader.frame(row) for row in self._rows[index])
+        return self._reader.frame(self._rows[index])
 
 
 class PinnedActive:

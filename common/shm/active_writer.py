@@ -1,7 +1,11 @@
 """Writing the active section: rows appended, learned columns by generation (docs/protocol-shm.md, section 5)."""
 
 import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -132,11 +136,11 @@ class ActiveWriter:
         failpoints.reach("shm.commit.before_reserve")
         learned = self._reserved(commit, buffer, moments_file)
         failpoints.reach("shm.commit.after_reserve")
-        self._append(commit, rows)
-        if commit.moments is not None:
-            self._write_moments(commit.moments, moments_file)
+        with _written_beside(partial(self._write_moments, commit.moments, moments_file)):
+            self._append(commit, rows)
+            self._write_learned(learned, commit)
         failpoints.reach("shm.commit.after_moments")
-        self._write_learned(learned, commit, moments_file)
+        self._write_record(learned, commit, moments_file)
         failpoints.reach("shm.commit.before_flip")
         new = State(epoch=self._state.epoch, number=self._state.number + 1, buffer=buffer)
         self._control.remember(new)
@@ -270,19 +274,24 @@ class ActiveWriter:
             self._appended.column(name, gaussians.count)[old:] = getattr(gaussians, name)[old:]
         failpoints.reach("shm.commit.after_ties")
 
-    def _write_moments(self, moments: SectionMoments, number: int) -> None:
+    def _write_moments(self, moments: SectionMoments | None, number: int) -> None:
+        if moments is None:
+            return
         file = self._moments[number]
         for (name, _, _), attribute in zip(LEARNED_COLUMNS, moments.in_order(), strict=True):
             file.column(f"m_{name}", attribute.m.shape[0])[:] = attribute.m
             file.column(f"v_{name}", attribute.v.shape[0])[:] = attribute.v
 
-    def _write_learned(self, file: GrowingFile, commit: Commit, moments_file: int) -> None:
-        section = commit.section
+    def _write_learned(self, file: GrowingFile, commit: Commit) -> None:
+        gaussians = commit.section.gaussians
         for name, _, _ in LEARNED_COLUMNS:
-            file.column(name, section.gaussians.count)[:] = getattr(section.gaussians, name)
+            file.column(name, gaussians.count)[:] = getattr(gaussians, name)
             if name == "colors":
                 failpoints.reach("shm.commit.after_colors")
         failpoints.reach("shm.commit.after_columns")
+
+    def _write_record(self, file: GrowingFile, commit: Commit, moments_file: int) -> None:
+        section = commit.section
         record = np.zeros(1, RECORD)
         record["num_frames"], record["num_gaussians"] = len(section.frames), section.gaussians.count
         record["generation"] = self._state.number + 1
@@ -311,6 +320,15 @@ class ActiveWriter:
 
     def _kept_buffers(self) -> set[int]:
         return self._control.kept_buffers(self._state.number, self._layout.kept)
+
+
+@contextmanager
+def _written_beside(write: Callable[[], None]) -> Iterator[None]:
+    """Let a large part be written in a thread of its own meanwhile; it has been once this ends."""
+    with ThreadPoolExecutor(1) as thread:
+        written = thread.submit(write)
+        yield
+    written.result()
 
 
 def _head_of(fd: int) -> npt.NDArray[np.uint8]:

@@ -1,6 +1,7 @@
 """What a section costs the map store while it is mapped, and so how many Gaussians it may have."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.shm.active_layout import MOMENT_COLUMNS, RECORD_BYTES
@@ -25,6 +26,7 @@ class MappingCost:
     bytes_each: int
 
     @classmethod
+    @lru_cache(maxsize=8)  # asked several times for each frame
     def of(cls, camera: Camera, *, frames: int, views: int, with_moments: bool, kept_generations: int) -> "MappingCost":
         """Of sections of at most ``frames`` frames.
 

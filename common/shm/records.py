@@ -1,5 +1,6 @@
 """What the map store takes and gives: sections, what is needed to go on mapping one, and the last commit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,7 +117,7 @@ class ActiveState:
 
     generation: int
     section: Section
-    frames: tuple[Frame, ...]
+    frames: Sequence[Frame]
     trained_rows: tuple[int, ...]
     neighbour_ids: tuple[int, ...]
     moments: SectionMoments | None

@@ -69,17 +69,14 @@ def camera_fields(section_id: int, camera: Camera, depth_scale_m: float) -> tupl
 def packed_rows(frames: tuple[SectionFrame, ...], trained: Callable[[int], bool]) -> npt.NDArray[Any]:
     """The frame table as records [F] of `ROW`."""
     rows = np.zeros(len(frames), ROW)
-    for index, frame in enumerate(frames):
-        flags = KEEPS_DEPTH * (frame.view_depth is not None) | TRAINED * trained(index)
-        rows[index] = (
-            frame.frame_id,
-            frame.capture_time_ns,
-            frame.T_section_frame,
-            frame.exposure.gain,
-            frame.exposure.offset,
-            flags,
-            0,
-        )
+    if frames:  # by column, which takes a tenth of the time
+        rows["frame_id"] = [frame.frame_id for frame in frames]
+        rows["capture_time_ns"] = [frame.capture_time_ns for frame in frames]
+        rows["T_section_frame"] = [frame.T_section_frame for frame in frames]
+        rows["gain"] = [frame.exposure.gain for frame in frames]
+        rows["offset"] = [frame.exposure.offset for frame in frames]
+        keeps_depth = [KEEPS_DEPTH * (frame.view_depth is not None) for frame in frames]
+        rows["flags"] = [keeps | TRAINED * trained(index) for index, keeps in enumerate(keeps_depth)]
     return rows
 
 
@@ -87,15 +84,17 @@ def frames_of_rows(
     rows: npt.NDArray[Any], view_depth: Callable[[int], npt.NDArray[np.uint16]]
 ) -> tuple[SectionFrame, ...]:
     """The frame table of records; ``view_depth`` gives the depth of rows that keep theirs."""
+    columns = (rows["frame_id"].tolist(), rows["capture_time_ns"].tolist(), rows["flags"].tolist())
+    poses, gains, offsets = rows["T_section_frame"], rows["gain"], rows["offset"]
     return tuple(
         SectionFrame(
-            frame_id=int(row["frame_id"]),
-            capture_time_ns=int(row["capture_time_ns"]),
-            T_section_frame=row["T_section_frame"],
-            exposure=Exposure(gain=row["gain"], offset=row["offset"]),
-            view_depth=view_depth(index) if row["flags"] & KEEPS_DEPTH else None,
+            frame_id=frame_id,
+            capture_time_ns=capture_time_ns,
+            T_section_frame=poses[index],
+            exposure=Exposure(gain=gains[index], offset=offsets[index]),
+            view_depth=view_depth(index) if flags & KEEPS_DEPTH else None,
         )
-        for index, row in enumerate(rows)
+        for index, (frame_id, capture_time_ns, flags) in enumerate(zip(*columns, strict=True))
     )
 
 

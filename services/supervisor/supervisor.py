@@ -12,7 +12,6 @@ from vtslam.common.topics import (
     CONTROL,
     EVERY_SERVICE,
     FLEET_EVENT,
-    MAPPER_COMMITTED,
     SECTION_ARCHIVED,
     SECTION_SEALED,
     STATUS,
@@ -26,7 +25,7 @@ from vtslam.services.supervisor.progress import FleetProgress
 from vtslam.services.supervisor.stall import StallWatch
 from vtslam.storage.errors import WriteFailed
 
-_POLL_S = 0.1  # between looks at the processes, when the bus is silent
+_POLL_S = 0.1  # between looks at the processes and at what they committed, when the bus is silent
 _PARTING_S = 5.0  # that an expendable process has for its last step
 
 Environment = Callable[[str, int], Mapping[str, str]]  # of a process by name, at its n-th start
@@ -93,7 +92,6 @@ class Supervisor:
         self._link = ServiceLink(bus, 1)
         self._alive = bus.watch_alive()
         self._heartbeats = bus.subscriber(STATUS, service=EVERY_SERVICE)
-        self._commits = bus.subscriber(MAPPER_COMMITTED, newest_only=True)
         self._sealed = bus.subscriber(SECTION_SEALED)
         self._archived = bus.subscriber(SECTION_ARCHIVED)
         self._events = bus.subscriber(FLEET_EVENT)
@@ -148,7 +146,6 @@ class Supervisor:
             if child is not None:
                 child.heard(received.message, 1e-9 * received.arrival_time_ns)
                 self._tell_of(received.message)
-        self._commits.receive()  # wakes; what was committed is in the journal
         while (sealed := self._sealed.receive()) is not None:
             self.progress.sealed(sealed.message)
         while (archived := self._archived.receive()) is not None:

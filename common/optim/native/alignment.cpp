@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <vector>
 
 #include "motion.hpp"
@@ -69,10 +68,11 @@ constexpr int kWindowRadius = 4, kWindowStride = 2, kMinSamples = 9;
 }  // namespace
 
 void normals_from_depth(const float* depth, int width, int height, const Pinhole& camera, float max_relative_step,
-                        float* normals) {
-  std::memset(normals, 0, sizeof(float) * 3 * width * static_cast<size_t>(height));
-  for (int v = 0; v < height; ++v) {
-    for (int u = 0; u < width; ++u) {
+                        int stride, float* normals) {
+  float* normal = normals;
+  for (int v = 0; v < height; v += stride) {
+    for (int u = 0; u < width; u += stride, normal += 3) {
+      normal[0] = normal[1] = normal[2] = 0.0f;
       const size_t i = static_cast<size_t>(v) * width + u;
       const float z = depth[i];
       if (!(z > 0)) continue;
@@ -93,9 +93,9 @@ void normals_from_depth(const float* depth, int width, int height, const Pinhole
                         ny * (v + 0.5 - camera.cy) / camera.fy;
       const double length = std::sqrt(nx * nx + ny * ny + nz * nz);
       if (!(length > 0)) continue;
-      normals[3 * i] = static_cast<float>(nx / length);
-      normals[3 * i + 1] = static_cast<float>(ny / length);
-      normals[3 * i + 2] = static_cast<float>(nz / length);
+      normal[0] = static_cast<float>(nx / length);
+      normal[1] = static_cast<float>(ny / length);
+      normal[2] = static_cast<float>(nz / length);
     }
   }
 }

@@ -72,10 +72,11 @@ NormalEquations normal_equations(const ReferenceView& reference, const ObservedV
 int64_t visible_points(const ReferencePoints& map, const double R[9], const double t[3], const RenderedDepth& rendered,
                        float tolerance, float* packed);
 
-// Unit normals [H,W,3] of a depth image by a plane fit over a 9x9 window; zero where there is too little surface.
-// A window this wide is needed: a Kinect's depth steps are as large as its pixels are apart.
+// Unit normals of every stride-th pixel of every stride-th row of a depth image, by a plane fit over a 9x9 window; zero
+// where there is too little surface. A window this wide is needed: a Kinect's depth steps are as large as its pixels are
+// apart.
 void normals_from_depth(const float* depth, int width, int height, const Pinhole& camera, float max_relative_step,
-                        float* normals);
+                        int stride, float* normals);
 
 struct TrackingLossInput {
   const float* rgb;           // rendered [H,W,3]

@@ -104,14 +104,16 @@ Out<float, 2> visible_points(In<float, 2> points, In<double, 2> T_camera_map, In
   return Out<float, 2>(packed, {static_cast<size_t>(kept), 6}, owner);
 }
 
-Out<float, 3> normals_from_depth(In<float, 2> depth, Intrinsics camera, float max_relative_step) {
-  const size_t h = depth.shape(0), w = depth.shape(1);
+Out<float, 3> normals_from_depth(In<float, 2> depth, Intrinsics camera, float max_relative_step, int stride) {
+  if (stride < 1) throw nb::value_error("stride: not positive");
+  const size_t step = static_cast<size_t>(stride);
+  const size_t h = (depth.shape(0) + step - 1) / step, w = (depth.shape(1) + step - 1) / step;
   nb::capsule owner;
   float* normals = owned<float>(3 * h * w, owner);
   {
     nb::gil_scoped_release release;
-    vtslam::normals_from_depth(depth.data(), static_cast<int>(w), static_cast<int>(h), pinhole(camera),
-                               max_relative_step, normals);
+    vtslam::normals_from_depth(depth.data(), static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)),
+                               pinhole(camera), max_relative_step, stride, normals);
   }
   return Out<float, 3>(normals, {h, w, 3}, owner);
 }
@@ -159,8 +161,8 @@ NB_MODULE(_align, m) {
         "H [6,6], g [6], colour cost, depth cost, colour count, depth count.");
   m.def("visible_points", &visible_points, "points"_a, "T_camera_map"_a, "depth"_a, "camera"_a, "tolerance"_a,
         "Points [M,6] (position, normal; camera frame) that a rendered depth image shows.");
-  m.def("normals_from_depth", &normals_from_depth, "depth"_a, "camera"_a, "max_relative_step"_a,
-        "Unit normals [H,W,3] of a depth image (m); zero where unknown.");
+  m.def("normals_from_depth", &normals_from_depth, "depth"_a, "camera"_a, "max_relative_step"_a, "stride"_a,
+        "Unit normals of every stride-th pixel and row of a depth image (m); zero where unknown.");
   m.def("tracking_loss", &tracking_loss, "rgb"_a, "depth"_a, "alpha"_a, "target_rgb"_a, "target_depth"_a, "mask"_a,
         "silhouette_threshold"_a, "color_weight"_a, "depth_weight"_a,
         "Eq. 1: colour sum, depth sum, pixel count, d_rgb [H,W,3], d_depth [H,W].");
