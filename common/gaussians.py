@@ -118,7 +118,10 @@ class ViewTiedGaussians:
         """
         return np.asarray(
             _points.tied_points(
-                *(np.ascontiguousarray(each) for each in (self.frame_index, self.pixel, self.subpixel, self.depth)),
+                np.ascontiguousarray(self.frame_index),
+                np.ascontiguousarray(self.pixel),
+                np.ascontiguousarray(self.subpixel),
+                np.ascontiguousarray(self.depth),
                 np.ascontiguousarray(T_section_frames, np.float64),
                 SUBPIXEL_OFFSETS_PX,
                 camera.width,

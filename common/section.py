@@ -61,10 +61,16 @@ class Section:
     means_m: npt.NDArray[np.float32]
     surface: npt.NDArray[np.float32]
 
-    def retied(self) -> "Section":
-        """The section with positions and surface computed anew from its frames' poses."""
-        bare = replace(self, surface=np.zeros((0, 6), np.float32))
-        return replace(bare, means_m=self._means_of(self.gaussians), surface=bare._surface_with(self.frames))
+    def retied(self, earlier: "Section | None" = None) -> "Section":
+        """The section with positions and surface computed from its frames' poses.
+
+        Args:
+            earlier: A former state of it, from which the surface is taken as far as that goes.
+        """
+        bare = earlier or replace(self, surface=np.zeros((0, 6), np.float32), frames=())
+        known = {each.frame_id for each in bare.frames if each.view_depth is not None}
+        surface = bare._surface_with([each for each in self.frames if each.frame_id not in known])
+        return replace(self, means_m=self._means_of(self.gaussians), surface=surface)
 
     def grown(self, frame: SectionFrame, new: ViewTiedGaussians) -> "Section":
         """The section with one more frame and the Gaussians tied to it."""

@@ -35,8 +35,13 @@ class StoreArchive:
     ) -> None:
         self._store, self._elsewhere, self._load = store, elsewhere, load
 
-    def read(self, section_id: int) -> Section:
-        """A finished section: a copy, so that it may leave the store."""
+    def read(self, section_id: int, former: Section | None = None) -> Section:
+        """A finished section: a copy, so that it may leave the store.
+
+        Args:
+            section_id: The section.
+            former: As it was before it was finished, if that is known: its surface is not worked out again.
+        """
         for _ in range(_LOADS):
             try:
                 held = self._store.pinned_sealed(section_id)
@@ -45,7 +50,7 @@ class StoreArchive:
                     break
                 continue
             try:
-                return _copied(held.section).retied()
+                return _copied(held.section).retied(former)
             finally:
                 held.release()
         return self._elsewhere.read(section_id)
@@ -95,7 +100,7 @@ class MapFollower:
         poses: ``T_section_frame`` float64 [4,4] of the active section's frames up to then.
     """
 
-    def __init__(self, store: MapStore, archive: ReadsSections, *, candidate_interval: int) -> None:
+    def __init__(self, store: MapStore, archive: StoreArchive, *, candidate_interval: int) -> None:
         self._store, self._archive = store, archive
         self.map = SectionMap(archive, candidate_interval=candidate_interval)
         self.facts: CommitFacts | None = None
@@ -190,7 +195,9 @@ class MapFollower:
         last = self._store.last_commit()
         if last is None or not last.is_sealed:
             return
-        self.map.sealed(self._archive.read(last.section_id))
+        active = self.map.active
+        former = active if active is not None and active.section_id == last.section_id else None
+        self.map.sealed(self._archive.read(last.section_id, former))
         self.facts, self.frame, self.poses = CommitFacts.unpacked(last.facts), last.frame, ()
         self.release()
         self._means_m = None

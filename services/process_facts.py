@@ -1,6 +1,5 @@
 """What a process can say of itself (memory, the versions its results may depend on), and of other processes."""
 
-import contextlib
 import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -56,19 +55,6 @@ def cpu_seconds(pid: int) -> float:
     except OSError:
         return 0.0
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def yield_to_others() -> None:
-    """Let this process and what it starts run only where nobody else wants to: nice 19, SCHED_IDLE.
-
-    Where the kernel groups processes by session, that counts within its own; a process that leads a session lowers the
-    session too. Threads that there are already keep theirs.
-    """
-    os.nice(19)
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    if os.getsid(0) == os.getpid():
-        with contextlib.suppress(OSError):  # not every kernel has groups
-            Path("/proc/self/autogroup").write_text("19")
 
 
 def _status_mb(path: Path, key: str) -> float:

@@ -9,6 +9,7 @@ from vtslam.common.bus import Member
 from vtslam.common.bus_zenoh import join
 from vtslam.common.config import ConfigError, load
 from vtslam.common.fleet_folder import FleetFolder, read_owner, running_fleets
+from vtslam.common.scheduling import yield_to_others
 from vtslam.common.settings import Settings
 from vtslam.common.shm.errors import SharedMemoryError
 from vtslam.common.topics import Role
@@ -17,7 +18,6 @@ from vtslam.services.cli.console import Console, Progress
 from vtslam.services.cli.record_command import follow
 from vtslam.services.cli.stop_request import StopRequest
 from vtslam.services.film import write_film
-from vtslam.services.process_facts import yield_to_others
 from vtslam.services.recorded_run import RecordedRun
 from vtslam.services.run_view import show_run
 from vtslam.services.sensor.sources.registry import open_source

@@ -88,10 +88,10 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
     from vtslam.common.bus import Member, run_steps
     from vtslam.common.bus_zenoh import join
     from vtslam.common.config import load
+    from vtslam.common.scheduling import yield_to_others
     from vtslam.common.settings import Settings
     from vtslam.common.shm.errors import MapStoreFull, SharedMemoryFull
     from vtslam.services.free_memory import keep_large_arrays_apart
-    from vtslam.services.process_facts import yield_to_others
     from vtslam.services.sensor.sources.base import SourceError
     from vtslam.services.service_link import ServiceLink
     from vtslam.services.supervisor.processes import process_named
@@ -124,7 +124,7 @@ def _run(args: argparse.Namespace, folder: FleetFolder) -> int:
 
 
 def _sensor(parts: _Parts) -> "Steps":
-    from vtslam.common.scheduling import answer_at_once
+    from vtslam.common.scheduling import answer_at_once, give_way
     from vtslam.services.sensor.live import LiveSensor
     from vtslam.services.sensor.replay import ReplaySensor
     from vtslam.services.sensor.service import RecordingSensor
@@ -140,6 +140,7 @@ def _sensor(parts: _Parts) -> "Steps":
         sensor = ReplaySensor(bus, link, source, ring_path, rate_hz=pace.replay_hz)
         answer_at_once()  # as a camera's driver would; the thread that reads has started
         return sensor
+    give_way()  # it reads ahead
     durable = parts.run.catalog.num_frames  # when the sensor starts for the first time, these are all
     return RecordingSensor(
         bus, link, source, ring_path, credit=pace.credit, frames_before=durable, is_recorded=is_recorded
@@ -147,6 +148,7 @@ def _sensor(parts: _Parts) -> "Steps":
 
 
 def _tracker(parts: _Parts) -> "Steps":
+    from vtslam.common.scheduling import give_way
     from vtslam.services.engines import fleet_threads, make_engine, thread_count, with_threads
     from vtslam.services.map_follower import MapFollower
     from vtslam.services.supervisor.store import map_store
@@ -166,6 +168,8 @@ def _tracker(parts: _Parts) -> "Steps":
     bus, link, ring_path, pace = parts.bus, parts.link, parts.folder.ring_path, parts.pace
     if pace.is_realtime:
         return RealtimeTracker(bus, link, core, follower, ring_path)
+    if pace.lead:
+        give_way()  # its pose is wanted when the mapper is done with the frame before
     return TrackerService(bus, link, core, follower, ring_path, settings=settings, lead=pace.lead)
 
 
@@ -201,12 +205,14 @@ def _archive(parts: _Parts, store: "MapStore") -> "StoreArchive":
 
 
 def _archiver(parts: _Parts) -> "Steps":
+    from vtslam.common.scheduling import give_way
     from vtslam.services.archiver.service import ArchiverService
     from vtslam.services.frame_journal import JournalReader
     from vtslam.services.free_memory import keep_large_arrays_apart
     from vtslam.services.supervisor.store import map_store
     from vtslam.storage.run_folder import RunFolder
 
+    give_way()
     keep_large_arrays_apart(rare=True)  # it has a section in hand when one comes or goes, and nothing between
     return ArchiverService(
         parts.bus,

@@ -248,7 +248,7 @@ def test_what_was_done_before_a_stop_is_kept_and_its_short_section_mapped_again(
     small: SmallRecording, tmp_path: Path
 ) -> None:
     calm = Disturbance()
-    summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames > SECTION)
+    summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames >= SECTION)
 
     assert summary.interrupted
     assert SECTION < summary.frames < FRAMES

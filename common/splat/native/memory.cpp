@@ -16,6 +16,7 @@ namespace {
 constexpr std::size_t kHugePage = std::size_t(2) << 20;
 constexpr std::size_t kHeader = 64;  // holds the block's capacity, keeps the alignment
 constexpr std::size_t kKeptBytes = std::size_t(192) << 20;
+constexpr std::size_t kLargest = 8;  // a block of so many times the size wanted still does
 constexpr std::uint64_t kStale = 1024;  // blocks taken since, some eighty renderings: the scene has other sizes now
 
 struct Kept {
@@ -72,11 +73,11 @@ void* acquire_block(std::size_t bytes) {
   {
     const std::lock_guard lock(kept.mutex);
     ++kept.taken;
-    // A block somewhat too large does, so that a scene that grows leaves no trail of sizes behind.
+    // A block too large does: a section's arrays grow until it ends, and the next one's start small again.
     std::size_t best = kept.blocks.size();
     for (std::size_t i = 0; i < kept.blocks.size(); ++i) {
       const std::size_t has = capacity_of(kept.blocks[i].block);
-      if (has >= capacity && has <= capacity + capacity / 4 &&
+      if (has >= capacity && has / kLargest <= capacity &&
           (best == kept.blocks.size() || has <= capacity_of(kept.blocks[best].block)))
         best = i;
     }
