@@ -174,10 +174,13 @@ def _tracker(parts: _Parts) -> "Steps":
 
 
 def _mapper(parts: _Parts) -> "Steps":
+    from vtslam.common.scheduling import give_way
     from vtslam.services.engines import fleet_threads, make_engine, with_threads
     from vtslam.services.mapper.service import FleetPaths, MapperService
     from vtslam.services.supervisor.store import map_store
 
+    if parts.pace.is_realtime:
+        give_way()  # a pose of now comes before the map
     store, settings = map_store(parts.folder, parts.settings), parts.settings
     threads = fleet_threads(settings, settings.fleet.mapper_threads, is_realtime=parts.pace.is_realtime)
     return MapperService(

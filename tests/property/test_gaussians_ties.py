@@ -1,5 +1,7 @@
 """Ties hold for any camera, depth and pose."""
 
+from dataclasses import fields
+
 import numpy as np
 import numpy.typing as npt
 from hypothesis import given
@@ -43,6 +45,8 @@ def test_every_gaussian_projects_to_its_tie_from_any_pose(
     np.testing.assert_allclose(points[:, 2], gaussians.depth * unit_m, rtol=1e-12)
     poses = np.stack([se3.exp((k + 1) * twist / 3) for k in range(3)])
     means = gaussians.means_m(camera, poses, depth_unit_m=unit_m)
+    some = ViewTiedGaussians(**{each.name: getattr(gaussians, each.name)[7:23] for each in fields(gaussians)})
+    assert some.means_m(camera, poses, depth_unit_m=unit_m).tobytes() == means[7:23].tobytes()
     for row in range(count):
         T = poses[gaussians.frame_index[row]]
         # float32 rounds relative to the largest coordinate.

@@ -137,6 +137,18 @@ def test_empty_has_no_positions() -> None:
     assert empty.means_m(CAMERA, np.zeros((0, 4, 4)), depth_unit_m=1.0).shape == (0, 3)
 
 
+def test_a_tie_to_what_is_not_there_is_refused() -> None:
+    gaussians = tied(frame_with_holes(), frame_index=2)
+    with pytest.raises(IndexError, match="not there"):
+        gaussians.means_m(CAMERA, np.stack([np.eye(4)] * 2), depth_unit_m=0.001)
+    with pytest.raises(IndexError, match="not there"):
+        replace(gaussians, subpixel=np.full_like(gaussians.subpixel, 5)).means_m(
+            CAMERA, np.stack([np.eye(4)] * 3), depth_unit_m=0.001
+        )
+    with pytest.raises(ValueError, match="different lengths"):
+        replace(gaussians, depth=gaussians.depth[1:]).means_m(CAMERA, np.stack([np.eye(4)] * 3), depth_unit_m=0.001)
+
+
 def test_other_attributes_keep_the_ties() -> None:
     gaussians = tied(frame_with_holes())
     other = gaussians.with_attributes(

@@ -1,7 +1,9 @@
-"""Threads that hand messages on do not wait for others' time slices."""
+"""Threads that hand messages on wait for nobody's time slice; who works ahead leaves others the processors."""
 
 import os
 import re
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -36,7 +38,7 @@ def slice_of_new_thread_ns() -> int:
     return found[0]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def _kernel_has_slices() -> None:
     release = re.match(r"(\d+)\.(\d+)", os.uname().release)
     assert release is not None
@@ -50,6 +52,7 @@ def _kernel_has_slices() -> None:
         pytest.skip("the kernel does not tell")
 
 
+@pytest.mark.usefixtures("_kernel_has_slices")
 def test_threads_started_within_have_the_shortest_slice_and_others_what_is_usual() -> None:
     usual = own_slice_ns()
     assert usual > SHORTEST_NS
@@ -59,6 +62,7 @@ def test_threads_started_within_have_the_shortest_slice_and_others_what_is_usual
     assert slice_of_new_thread_ns() == usual
 
 
+@pytest.mark.usefixtures("_kernel_has_slices")
 def test_what_runs_only_where_nobody_else_wants_to_stays_so() -> None:
     found: list[int] = []
 
@@ -73,6 +77,7 @@ def test_what_runs_only_where_nobody_else_wants_to_stays_so() -> None:
     assert found == [os.SCHED_IDLE]
 
 
+@pytest.mark.usefixtures("_kernel_has_slices")
 def test_all_threads_of_sessions_on_the_bus_answer_at_once(tmp_path: Path) -> None:
     with Hub(tmp_path / "hub", "test"), join(Member(fleet="test", role=Role.TRACKER), tmp_path / "hub"):
         names = {path.parent.name: path.read_text() for path in Path("/proc/self/task").glob("[0-9]*/comm")}
@@ -81,6 +86,7 @@ def test_all_threads_of_sessions_on_the_bus_answer_at_once(tmp_path: Path) -> No
         assert {each for thread, each in slices_ns().items() if thread in zenohs} == {SHORTEST_NS}
 
 
+@pytest.mark.usefixtures("_kernel_has_slices")
 def test_a_thread_may_answer_at_once_from_now_on() -> None:
     found: list[int] = []
 
@@ -93,3 +99,24 @@ def test_a_thread_may_answer_at_once_from_now_on() -> None:
     thread.join()
     assert found == [SHORTEST_NS, SHORTEST_NS]
     assert own_slice_ns() > SHORTEST_NS
+
+
+@pytest.mark.parametrize(("way", "nice"), [("give_way", 10), ("yield_to_others", 19)])
+@pytest.mark.parametrize("leads", [True, False])
+def test_a_process_that_steps_back_takes_its_session_along_if_it_leads_one(way: str, nice: int, *, leads: bool) -> None:
+    group = Path("/proc/self/autogroup")
+    lines = [
+        "import os",
+        "from pathlib import Path",
+        f"from vtslam.common.scheduling import {way}",
+        f"{way}()",
+        f"group = Path('{group}')",
+        "print(os.getpriority(os.PRIO_PROCESS, 0), group.read_text().split()[-1] if group.exists() else 'none')",
+    ]
+    command = [sys.executable, "-c", "\n".join(lines)]
+    said = subprocess.run(command, start_new_session=leads, capture_output=True, text=True, check=True).stdout.split()
+    assert int(said[0]) == nice + os.getpriority(os.PRIO_PROCESS, 0)
+    if leads and group.exists():
+        assert said[1] in (str(nice), "none")
+    elif group.exists():
+        assert said[1] == group.read_text().split()[-1]

@@ -11,6 +11,7 @@ from vtslam.common.gaussians import tied_to_frame
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim.surface import measured_surface
+from vtslam.common.rows import GrowingRows
 from vtslam.common.section import Section, SectionFrame, joined_splats
 from vtslam.common.splat.native_engine import NativeEngine
 
@@ -88,6 +89,22 @@ def test_a_finished_section_is_as_it_will_be_read_back(knew_its_depth: bool) -> 
     assert finished.surface.tobytes() == anew.surface.tobytes()
     assert len(finished.surface) > len(section.surface)
     assert finished.means_m.tobytes() == anew.means_m.tobytes()
+
+
+def test_what_is_known_of_a_former_state_gives_the_same_as_tying_anew() -> None:
+    section = small_section()
+    frame = SmoothRoom().frame(START @ STEP @ STEP, CAMERA, frame_id=2)
+    new = tied_to_frame(frame, frame.depth > 0, frame_index=2, depth_factor=1.01, opacity=0.9)
+    row = SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP, view_depth=frame.depth)
+    grown = section.grown(row, new)
+    bare = replace(grown, means_m=np.zeros((0, 3), np.float32), surface=np.zeros((0, 6), np.float32))
+    for later in (bare.continued(section, GrowingRows(section.means_m)), bare.retied(section), bare.retied(grown)):
+        assert later.means_m.tobytes() == grown.means_m.tobytes()
+        assert later.surface.tobytes() == grown.surface.tobytes()
+    # The last frame may keep its depth only when the section is finished.
+    open_end = replace(grown, frames=(*grown.frames[:2], replace(row, view_depth=None))).retied()
+    finished = open_end.finished(2, frame.depth)
+    assert finished.retied(open_end).surface.tobytes() == finished.surface.tobytes() == grown.surface.tobytes()
 
 
 def test_the_surface_is_what_the_views_with_depth_measured() -> None:
