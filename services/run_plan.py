@@ -155,8 +155,9 @@ class RunPlan:
     @contextmanager
     def _made_folder(self, folder: Path, info: RunInfo, *, overwrite: bool) -> Iterator[RunFolder]:
         """A new run folder; an earlier recording goes only once that is made and so nothing is refused any more."""
-        check_way(self.settings.recorder, overwrite=overwrite, used=SourceUri.parse(self.source.uri).files())
-        with RunFolder.create(folder, info, overwrite=overwrite) as run:
+        used = SourceUri.parse(self.source.uri).files()
+        check_way(self.settings.recorder, overwrite=overwrite, used=used)
+        with RunFolder.create(folder, info, overwrite=overwrite, used=used) as run:
             make_way(self.settings.recorder, overwrite=overwrite)
             yield run
 

@@ -66,7 +66,7 @@ class RunFolder:
         self._catalog: Catalog | None = None
 
     @classmethod
-    def create(cls, path: Path, info: RunInfo, *, overwrite: bool = False) -> Self:
+    def create(cls, path: Path, info: RunInfo, *, overwrite: bool = False, used: Sequence[str] = ()) -> Self:
         """Make a run folder and open it for writing.
 
         Args:
@@ -74,13 +74,16 @@ class RunFolder:
                 are deleted; other files in it are kept.
             info: Written to ``run.toml``.
             overwrite: Give up an earlier run in ``path``.
+            used: Files that the new run reads; texts that name no file do no harm.
 
         Raises:
-            RunFolderError: ``path`` holds something else, or a run and ``overwrite`` is not set.
+            RunFolderError: ``path`` holds something else, or a run and ``overwrite`` is not set, or one whose
+                trajectory is used.
             RunLocked: Another process is writing there.
             WriteFailed: The operating system refused.
         """
         _refuse_unless_free(path, overwrite)
+        _refuse_if_used(path / _TRAJECTORY, used)
         try:
             path.mkdir(parents=True, exist_ok=True)
             lock = _take_lock(path)
@@ -343,6 +346,12 @@ def _refuse_unless_free(path: Path, overwrite: bool) -> None:
             raise RunFolderError(f"{path}: there is already a run here; choose another folder or ask to overwrite it")
     elif not all(_is_own_leftover(entry) for entry in path.iterdir()):
         raise RunFolderError(f"{path}: not empty and not a run folder; choose another folder")
+
+
+def _refuse_if_used(trajectory: Path, used: Sequence[str]) -> None:
+    """Raise RunFolderError if a file that would be given up is read meanwhile."""
+    if trajectory.is_file() and any(os.path.exists(each) and trajectory.samefile(each) for each in used):
+        raise RunFolderError(f"{trajectory}: expected a run that nobody reads, found poses of the new one")
 
 
 def _is_own_leftover(entry: Path) -> bool:

@@ -239,3 +239,16 @@ def _wait(is_so: Callable[[], bool]) -> None:
             return
         time.sleep(POLL_S)
     raise AssertionError("it did not come to that in time")
+
+
+def test_a_run_whose_poses_are_read_is_not_given_up(
+    small: SmallRecording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    small_plan(small.files, "source.frames=0:2").execute(run)
+    whole = (run / "trajectory.txt").read_bytes()
+    words = ["--poses", str(run / "trajectory.txt"), "--frames", "0:2", "--in-process", "--overwrite"]
+    assert main(["run", small.files.uri, *words, "--out", str(run)]) == 1
+    assert "expected a run that nobody reads, found poses of the new one" in capsys.readouterr().err
+    assert (run / "trajectory.txt").read_bytes() == whole
+    assert main(["run", small.files.uri, *words, "--out", str(tmp_path / "again")]) == 0
