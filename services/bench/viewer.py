@@ -82,7 +82,12 @@ def bench_viewer(plan: RunPlan, *, rounds: int, on_part: Callable[[str], None]) 
         Seconds per frame of each run (processor time of tracker and mapper, time on the clock), over the whole of it
         and, ``late``, over its second half; and medians over those without a viewer: for the undisturbed viewer of the
         whole run, for the others of what came after the disturbance.
+
+    Raises:
+        ViewerError: The viewer cannot be used here: a fleet goes on without it, and nothing would be measured.
     """
+    from vtslam.services.viewer import rerun_sink  # noqa: F401  # refuses where rerun is missing
+
     half = len(plan.source) // 2
     runs: dict[str, dict[str, list[float]]] = {
         kind: {name: [] for name in ("cpu_s", "wall_s", "late_cpu_s", "late_wall_s")} for kind in KINDS
