@@ -73,8 +73,8 @@ int64_t visible_points(const ReferencePoints& map, const double R[9], const doub
                        float tolerance, float* packed);
 
 // Unit normals of every stride-th pixel of every stride-th row of a depth image, by a plane fit over a 9x9 window; zero
-// where there is too little surface. A window this wide is needed: a Kinect's depth steps are as large as its pixels are
-// apart.
+// where there is too little surface. A window this wide is needed: a Kinect's depth steps are as large as its pixels
+// are apart.
 void normals_from_depth(const float* depth, int width, int height, const Pinhole& camera, float max_relative_step,
                         int stride, float* normals);
 

@@ -16,7 +16,7 @@ namespace {
 constexpr std::size_t kHugePage = std::size_t(2) << 20;
 constexpr std::size_t kHeader = 64;  // holds the block's capacity, keeps the alignment
 constexpr std::size_t kKeptBytes = std::size_t(192) << 20;
-constexpr std::size_t kLargest = 8;  // a block of so many times the size wanted still does
+constexpr std::size_t kLargest = 8;     // a block of so many times the size wanted still does
 constexpr std::uint64_t kStale = 1024;  // blocks taken since, some eighty renderings: the scene has other sizes now
 
 struct Kept {
