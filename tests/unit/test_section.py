@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from helpers.smooth_room import SmoothRoom, small_camera
 
-from vtslam.common.gaussians import tied_to_frame
+from vtslam.common.gaussians import ViewTiedGaussians, tied_to_frame
 from vtslam.common.geometry import se3
 from vtslam.common.geometry.camera import Camera
 from vtslam.common.optim.surface import measured_surface
@@ -49,6 +49,13 @@ def small_section(section_id: int = 0, T_world_section: npt.NDArray[np.float64] 
     ).retied()
 
 
+def third_frame() -> tuple[SectionFrame, ViewTiedGaussians]:
+    """What a small section grows by; the frame keeps its depth."""
+    frame = SmoothRoom().frame(START @ STEP @ STEP, CAMERA, frame_id=2)
+    new = tied_to_frame(frame, frame.depth > 0, frame_index=2, depth_factor=1.01, opacity=0.9)
+    return SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP, view_depth=frame.depth), new
+
+
 def test_positions_are_recomputed_from_the_frame_table() -> None:
     section = small_section()
     assert section.depth_unit_m == section.depth_scale_m * 1.01
@@ -64,9 +71,7 @@ def test_positions_are_recomputed_from_the_frame_table() -> None:
 
 def test_growing_gives_the_same_as_tying_anew() -> None:
     section = small_section()
-    frame = SmoothRoom().frame(START @ STEP @ STEP, CAMERA, frame_id=2)
-    new = tied_to_frame(frame, frame.depth > 0, frame_index=2, depth_factor=1.01, opacity=0.9)
-    row = SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP, view_depth=frame.depth)
+    row, new = third_frame()
     grown = section.grown(row, new)
     own = section.gaussians.count
     assert grown.gaussians.count == own + new.count
@@ -93,9 +98,7 @@ def test_a_finished_section_is_as_it_will_be_read_back(knew_its_depth: bool) -> 
 
 def test_what_is_known_of_a_former_state_gives_the_same_as_tying_anew() -> None:
     section = small_section()
-    frame = SmoothRoom().frame(START @ STEP @ STEP, CAMERA, frame_id=2)
-    new = tied_to_frame(frame, frame.depth > 0, frame_index=2, depth_factor=1.01, opacity=0.9)
-    row = SectionFrame(frame_id=2, capture_time_ns=2, T_section_frame=STEP @ STEP, view_depth=frame.depth)
+    row, new = third_frame()
     grown = section.grown(row, new)
     bare = replace(grown, means_m=np.zeros((0, 3), np.float32), surface=np.zeros((0, 6), np.float32))
     for later in (bare.continued(section, GrowingRows(section.means_m)), bare.retied(section), bare.retied(grown)):
@@ -103,7 +106,8 @@ def test_what_is_known_of_a_former_state_gives_the_same_as_tying_anew() -> None:
         assert later.surface.tobytes() == grown.surface.tobytes()
     # The last frame may keep its depth only when the section is finished.
     open_end = replace(grown, frames=(*grown.frames[:2], replace(row, view_depth=None))).retied()
-    finished = open_end.finished(2, frame.depth)
+    assert row.view_depth is not None
+    finished = open_end.finished(2, row.view_depth)
     assert finished.retied(open_end).surface.tobytes() == finished.surface.tobytes() == grown.surface.tobytes()
 
 
