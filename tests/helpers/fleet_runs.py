@@ -83,6 +83,7 @@ class Disturbance:
         pids: All that were seen.
         children: The processes as their supervisor sees them.
         map_peak_bytes, map_sealed_bytes: See `FleetProgress`.
+        on_step: Called after each step of the supervisor, and after a stop that was asked for in it.
     """
 
     signals: list[tuple[int, str, signal.Signals]] = field(default_factory=list)
@@ -93,6 +94,7 @@ class Disturbance:
     frames: int = 0
     map_peak_bytes: int = 0
     map_sealed_bytes: int = 0
+    on_step: Callable[[], None] = lambda: None
 
     @property
     def deaths(self) -> dict[str, int]:
@@ -131,6 +133,7 @@ class Disturbance:
             if pid is not None and supervisor.children[wanted[1]].is_ready:
                 os.kill(pid, wanted[2])
                 self.signals.remove(wanted)
+        self.on_step()
 
 
 class CutOff(BaseException):

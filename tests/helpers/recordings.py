@@ -1,8 +1,12 @@
 """Small synthetic recordings on disk, in the layouts of the readers."""
 
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event, Thread
 from typing import Protocol, TypeVar
 
 import cv2
@@ -80,6 +84,30 @@ def cut_in_half(path: Path) -> None:
     """Keep the first half of a file's bytes."""
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
+
+
+@contextmanager
+def read_once_told(path: Path) -> Iterator[Event]:
+    """Within, whoever reads the file waits until the event is set, for the first time; it is whole again after."""
+    data, told = path.read_bytes(), Event()
+    path.unlink()
+    os.mkfifo(path)
+
+    def feed() -> None:
+        told.wait()
+        path.write_bytes(data)  # a pipe: returns once somebody reads
+
+    feeder = Thread(target=feed, daemon=True)  # nobody may come
+    feeder.start()
+    try:
+        yield told
+    finally:
+        told.set()
+        end = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # lets the feeder go if nobody came
+        feeder.join()
+        os.close(end)
+        path.unlink()
+        path.write_bytes(data)
 
 
 @dataclass(slots=True, kw_only=True)

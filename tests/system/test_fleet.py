@@ -10,7 +10,7 @@ from urllib.request import urlopen
 import pytest
 from helpers.fleet_runs import FRAMES, SECTION, Disturbance, SmallRecording, fleet_run, result_bytes, small_plan
 from helpers.processes import leftovers
-from helpers.recordings import cut_in_half
+from helpers.recordings import cut_in_half, read_once_told
 from helpers.shared_data import shared_data
 
 from vtslam.common.config import ConfigError
@@ -247,11 +247,13 @@ def test_an_error_of_the_supervisor_loses_nothing_that_was_finished(small: Small
 def test_what_was_done_before_a_stop_is_kept_and_its_short_section_mapped_again(
     small: SmallRecording, tmp_path: Path
 ) -> None:
-    calm = Disturbance()
-    summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames >= SECTION)
+    late = small.files.color_path(SECTION + 2)
+    with read_once_told(late) as may_be_read:
+        calm = Disturbance(on_step=lambda: may_be_read.set() if calm.frames > SECTION else None)
+        summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames > SECTION)
 
     assert summary.interrupted
-    assert SECTION < summary.frames < FRAMES
+    assert SECTION < summary.frames < 2 * SECTION
     with RunFolder.open(tmp_path / "run") as run:
         facts, poses = run.read_info().facts, read_trajectory(run.trajectory_path).poses
         in_sections = sum(run.read_section(section_id).num_frames for section_id in run.section_ids())
@@ -261,7 +263,6 @@ def test_what_was_done_before_a_stop_is_kept_and_its_short_section_mapped_again(
     assert files["000000.vts"] == small.undisturbed["000000.vts"]
     assert small.undisturbed["trajectory.txt"].startswith(files["trajectory.txt"])
 
-    assert summary.frames % SECTION
     (tmp_path / "run" / "metrics.json").write_text("{}")
     resumed = plan_resume(tmp_path / "run").resume(tmp_path / "run")
     assert result_bytes(tmp_path / "run") == small.undisturbed
