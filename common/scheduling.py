@@ -3,9 +3,11 @@
 import ctypes
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+_PRIORITY = 1  # of real-time ones: the lowest, which is before all usual ones
 
 # Linux 6.12 and later: a thread that wakes runs before those with longer slices, so long as it uses less than its
 # share, which stays what it was. Earlier kernels take the number and ignore it.
@@ -37,20 +39,23 @@ def threads_that_answer_at_once() -> Iterator[None]:
     """Threads that this one starts within run as soon as they wake, although others use all processors.
 
     For threads that hand messages on: they work for microseconds and sleep again, and what they wait for a processor is
-    their whole delay. Does nothing where the system has no such thing, or where this thread runs by other than the
-    usual rules (SCHED_IDLE, real time).
+    their whole delay. They have real-time priority where this process may give it (root, CAP_SYS_NICE or
+    RLIMIT_RTPRIO), and else the shortest time slices: with these a thread still waits for the kernel's next tick where
+    another runs. Does nothing where the system has neither, or where this thread runs by other than the usual rules.
     """
-    changed = _set_slice(_SLICE_NS)
+    undo = _put_forward()
     try:
         yield
     finally:
-        if changed:
-            _set_slice(_USUAL)
+        undo()
 
 
 def answer_at_once() -> None:
-    """Let this thread run as soon as it wakes from now on; threads that it starts later too."""
-    _set_slice(_SLICE_NS)
+    """Let this thread run as soon as it wakes from now on; threads that it starts later too.
+
+    See :func:`threads_that_answer_at_once`.
+    """
+    _put_forward()
 
 
 def give_way() -> None:
@@ -81,15 +86,27 @@ def _step_back(nice: int) -> None:
             Path("/proc/self/autogroup").write_text(str(nice))
 
 
-def _set_slice(slice_ns: int) -> bool:
-    """Set that of the calling thread; whether the kernel took it."""
+def _put_forward() -> Callable[[], None]:
+    """Put the calling thread before those of the usual priority; what undoes it."""
+    if os.sched_getscheduler(0) != os.SCHED_OTHER:
+        return lambda: None
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_PRIORITY))
+    except OSError:  # not allowed
+        _set_slice(_SLICE_NS)
+        return lambda: _set_slice(_USUAL)
+    return lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _set_slice(slice_ns: int) -> None:
+    """Set that of the calling thread, where the kernel takes it."""
     number = _SYSCALLS.get(platform.machine())
-    if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
-        return False
+    if number is None:
+        return
     wanted = _SchedAttr(
         size=ctypes.sizeof(_SchedAttr),
         policy=os.SCHED_OTHER,
         nice=os.getpriority(os.PRIO_PROCESS, 0),
         runtime_ns=slice_ns,
     )
-    return bool(ctypes.CDLL(None).syscall(ctypes.c_long(number), 0, ctypes.byref(wanted), 0) == 0)
+    ctypes.CDLL(None).syscall(ctypes.c_long(number), 0, ctypes.byref(wanted), 0)

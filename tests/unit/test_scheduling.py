@@ -1,11 +1,16 @@
 """Threads that hand messages on wait for nobody's time slice; who works ahead leaves others the processors."""
 
+import errno
 import os
 import re
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self, TypeVar
 
 import pytest
 
@@ -15,90 +20,134 @@ from vtslam.common.scheduling import answer_at_once, threads_that_answer_at_once
 from vtslam.common.topics import Role
 
 SHORTEST_NS = 100_000
+R = TypeVar("R")
 
 
-def slices_ns() -> dict[str, int]:
-    """Of the threads of this process by id, as the kernel tells them."""
-    found = {}
-    for path in Path("/proc/self/task").glob("[0-9]*/sched"):
-        if (line := re.search(r"^se\.slice\s*:\s*(\d+)$", path.read_text(), re.MULTILINE)) is not None:
-            found[path.parent.name] = int(line[1])
-    return found
+@dataclass(frozen=True)
+class Standing:
+    """How the kernel treats a thread: its policy, priority within it, nice value and, where it tells, time slice."""
+
+    policy: int
+    priority: int
+    nice: int
+    slice_ns: int | None
+
+    @classmethod
+    def of(cls, thread: int) -> Self:
+        text = Path(f"/proc/self/task/{thread}/sched")
+        line = re.search(r"^se\.slice\s*:\s*(\d+)$", text.read_text() if text.exists() else "", re.MULTILINE)
+        return cls(
+            policy=os.sched_getscheduler(thread),
+            priority=os.sched_getparam(thread).sched_priority,
+            nice=os.getpriority(os.PRIO_PROCESS, thread),
+            slice_ns=None if line is None else int(line[1]),
+        )
+
+    @property
+    def answers_at_once(self) -> bool:
+        return (self.policy, self.priority) == (os.SCHED_RR, 1) or self.slice_ns == SHORTEST_NS
 
 
-def own_slice_ns() -> int:
-    return slices_ns()[str(threading.get_native_id())]
+def own_standing() -> Standing:
+    return Standing.of(threading.get_native_id())
 
 
-def slice_of_new_thread_ns() -> int:
-    found: list[int] = []
-    thread = threading.Thread(target=lambda: found.append(own_slice_ns()))
-    thread.start()
-    thread.join()
-    return found[0]
+def in_new_thread(work: Callable[[], R]) -> R:
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(work).result()
 
 
-@pytest.fixture
-def _kernel_has_slices() -> None:
+def has_slices() -> bool:
+    """Whether threads have slices of their own (from Linux 6.12 on), and the kernel tells which."""
     release = re.match(r"(\d+)\.(\d+)", os.uname().release)
     assert release is not None
-    if (int(release[1]), int(release[2])) < (6, 12):
-        pytest.skip("threads have slices of their own from Linux 6.12 on")
-    try:
-        found = slices_ns()
-    except OSError as error:
-        pytest.skip(f"the kernel does not tell: {error}")
-    if not found:
-        pytest.skip("the kernel does not tell")
+    return (int(release[1]), int(release[2])) >= (6, 12) and own_standing().slice_ns is not None
 
 
-@pytest.mark.usefixtures("_kernel_has_slices")
-def test_threads_started_within_have_the_shortest_slice_and_others_what_is_usual() -> None:
-    usual = own_slice_ns()
-    assert usual > SHORTEST_NS
+def may_have_real_time_priority() -> bool:
+    def ask() -> bool:
+        try:
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        except OSError:
+            return False
+        return True
+
+    return in_new_thread(ask)
+
+
+@pytest.fixture(params=["real-time priority", "short slices"])
+def means(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """What the system lets threads have."""
+    name = str(request.param)
+    if name == "short slices":
+        if not has_slices():
+            pytest.skip("the kernel has no slices, or does not tell")
+        refuse_real_time(monkeypatch)
+    elif not may_have_real_time_priority():
+        pytest.skip("this user may not have real-time priority")
+    return name
+
+
+def refuse_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the kernel does for users without the right."""
+    allowed = os.sched_setscheduler
+
+    def refuse(pid: int, policy: int, param: os.sched_param) -> None:
+        if policy in (os.SCHED_RR, os.SCHED_FIFO):
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+        allowed(pid, policy, param)
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+
+
+def test_threads_started_within_answer_at_once_and_others_as_usual(means: str) -> None:
+    usual = own_standing()
+    assert not usual.answers_at_once
     with threads_that_answer_at_once():
-        assert slice_of_new_thread_ns() == SHORTEST_NS
-    assert own_slice_ns() == usual
-    assert slice_of_new_thread_ns() == usual
+        inside = in_new_thread(own_standing)
+    assert inside.answers_at_once
+    assert (inside.policy == os.SCHED_RR) == (means == "real-time priority")
+    assert own_standing() == usual
+    assert in_new_thread(own_standing) == usual
 
 
-@pytest.mark.usefixtures("_kernel_has_slices")
+def test_a_process_that_stepped_back_stays_so_after_threads_that_answer_at_once(means: str) -> None:
+    def stepped_back() -> tuple[Standing, Standing]:
+        os.nice(3)
+        before = own_standing()
+        with threads_that_answer_at_once():
+            pass
+        return before, own_standing()
+
+    before, after = in_new_thread(stepped_back)
+    assert before == after
+    assert after.nice == own_standing().nice + 3
+
+
 def test_what_runs_only_where_nobody_else_wants_to_stays_so() -> None:
-    found: list[int] = []
-
-    def idle() -> None:
+    def idle() -> int:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         with threads_that_answer_at_once():
-            found.append(os.sched_getscheduler(0))
+            return os.sched_getscheduler(0)
 
-    thread = threading.Thread(target=idle)
-    thread.start()
-    thread.join()
-    assert found == [os.SCHED_IDLE]
+    assert in_new_thread(idle) == os.SCHED_IDLE
 
 
-@pytest.mark.usefixtures("_kernel_has_slices")
-def test_all_threads_of_sessions_on_the_bus_answer_at_once(tmp_path: Path) -> None:
+def test_all_threads_of_sessions_on_the_bus_answer_at_once(means: str, tmp_path: Path) -> None:
     with Hub(tmp_path / "hub", "test"), join(Member(fleet="test", role=Role.TRACKER), tmp_path / "hub"):
         names = {path.parent.name: path.read_text() for path in Path("/proc/self/task").glob("[0-9]*/comm")}
-        zenohs = {thread for thread, name in names.items() if re.fullmatch(r"(app|acc|net|rx|tx)-\d+\n", name)}
+        zenohs = [int(thread) for thread, name in names.items() if re.fullmatch(r"(app|acc|net|rx|tx)-\d+\n", name)]
         assert len(zenohs) >= 3
-        assert {each for thread, each in slices_ns().items() if thread in zenohs} == {SHORTEST_NS}
+        assert all(Standing.of(thread).answers_at_once for thread in zenohs)
 
 
-@pytest.mark.usefixtures("_kernel_has_slices")
-def test_a_thread_may_answer_at_once_from_now_on() -> None:
-    found: list[int] = []
-
-    def now_on() -> None:
+def test_a_thread_may_answer_at_once_from_now_on(means: str) -> None:
+    def now_on() -> tuple[Standing, Standing]:
         answer_at_once()
-        found.extend((own_slice_ns(), slice_of_new_thread_ns()))
+        return own_standing(), in_new_thread(own_standing)
 
-    thread = threading.Thread(target=now_on)
-    thread.start()
-    thread.join()
-    assert found == [SHORTEST_NS, SHORTEST_NS]
-    assert own_slice_ns() > SHORTEST_NS
+    assert all(standing.answers_at_once for standing in in_new_thread(now_on))
+    assert not own_standing().answers_at_once
 
 
 @pytest.mark.parametrize(("way", "nice"), [("give_way", 10), ("yield_to_others", 19)])
