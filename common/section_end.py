@@ -59,7 +59,8 @@ class SectionEnd:
                 or of a later one. None goes before the section is finished.
             row: At least 1.
         """
-        known, head = np.searchsorted(frame_index, (tracked_against(row, self.lead), 1)).tolist()
+        rows = np.array((tracked_against(row, self.lead), 1), frame_index.dtype)  # of another type, all would be cast
+        known, head = np.searchsorted(frame_index, rows).tolist()
         return bool(known + (1 + self.lead) * head > self.gaussians)
 
     def is_reached(self, section: Section) -> bool:

@@ -2,8 +2,8 @@
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from vtslam.common.shm.active_layout import (
 )
 from vtslam.common.shm.active_reader import ActiveReader, learned_buffers
 from vtslam.common.shm.blocks import CONTROL_BYTES, ControlPage, Kind, State, make_file, open_file, reserve
-from vtslam.common.shm.errors import SharedMemoryError
+from vtslam.common.shm.errors import MapStoreFull, SharedMemoryError, SharedMemoryFull
 from vtslam.common.shm.growing_file import Admission, GrowingFile
 from vtslam.common.shm.records import MAX_FACTS_BYTES, MAX_NEIGHBOURS, ActiveSpec, ActiveState, Commit, SectionMoments
 from vtslam.common.shm.section_columns import LEARNED_COLUMNS, TIE_COLUMNS, TRAINED, packed_rows
@@ -91,6 +91,8 @@ class ActiveWriter:
         self._trim()
         failpoints.reach("shm.adopt.after_trim")
         self._appended = GrowingFile(folder / APPENDED, self._layout.appended, admit, rows_reserved=self._num_gaussians)
+        self._images_reserved = self._num_frames
+        self._beside = ThreadPoolExecutor(1)
 
     @property
     def section_id(self) -> int:
@@ -136,7 +138,7 @@ class ActiveWriter:
         failpoints.reach("shm.commit.before_reserve")
         learned = self._reserved(commit, buffer, moments_file)
         failpoints.reach("shm.commit.after_reserve")
-        with _written_beside(partial(self._write_moments, commit.moments, moments_file)):
+        with self._written_beside(partial(self._write_moments, commit.moments, moments_file)):
             self._append(commit, rows)
             self._write_learned(learned, commit)
         failpoints.reach("shm.commit.after_moments")
@@ -151,6 +153,16 @@ class ActiveWriter:
         self._trim()
         failpoints.reach("shm.commit.after_trim")
         return new.number
+
+    def make_ready(self) -> None:
+        """Reserve what the next commit will surely take, while nobody waits for it.
+
+        What there is no memory for is left to the commit, which is then refused.
+        """
+        with suppress(MapStoreFull, SharedMemoryFull):
+            self._reserve_images(min(self._num_frames + 1, self._layout.max_frames))
+            for file in (*self._learned.values(), *self._moments.values()):
+                file.ensure_rows(self._num_gaussians)
 
     def drop_spares(self) -> None:
         """Give back what only a further commit would need; that one takes it anew."""
@@ -167,6 +179,7 @@ class ActiveWriter:
         """Give the descriptors back; the block stays."""
         for file in (self._appended, *self._learned.values(), *self._moments.values()):
             file.close()
+        self._beside.shutdown()
 
     # --- taking over ------------------------------------------------------------------------------------------------
 
@@ -227,6 +240,16 @@ class ActiveWriter:
 
     # --- writing ----------------------------------------------------------------------------------------------------
 
+    @contextmanager
+    def _written_beside(self, write: Callable[[], None]) -> Iterator[None]:
+        """Let a large part be written in another thread meanwhile; it has been once this ends."""
+        written = self._beside.submit(write)
+        try:
+            yield
+        finally:
+            wait([written])
+        written.result()
+
     def _spare_buffer(self) -> int:
         """A buffer that no kept generation is in and nobody has pinned."""
         taken = self._control.pinned_buffers() | self._kept_buffers()
@@ -234,11 +257,17 @@ class ActiveWriter:
         # Pins hold at most as many buffers as there are pins, so the count has an end.
         return free[0] if free else next(buffer for buffer in range(256) if buffer not in taken)
 
+    def _reserve_images(self, frames: int) -> None:
+        """Space for the images of so many frames of the section."""
+        layout = self._layout
+        for row in range(self._images_reserved, frames):
+            self._appended.reserve(layout.image_offset(row), layout.images.frame_bytes)
+            self._images_reserved = row + 1
+
     def _reserved(self, commit: Commit, buffer: int, moments_file: int) -> GrowingFile:
         """Space for all that the commit writes; the buffer it writes to."""
         count, layout = commit.section.gaussians.count, self._layout
-        for row in range(self._num_frames, len(commit.section.frames)):
-            self._appended.reserve(layout.image_offset(row), layout.images.frame_bytes)
+        self._reserve_images(len(commit.section.frames))
         self._appended.ensure_rows(count)
         if moments_file >= 0:
             if moments_file not in self._moments:
@@ -320,15 +349,6 @@ class ActiveWriter:
 
     def _kept_buffers(self) -> set[int]:
         return self._control.kept_buffers(self._state.number, self._layout.kept)
-
-
-@contextmanager
-def _written_beside(write: Callable[[], None]) -> Iterator[None]:
-    """Let a large part be written in a thread of its own meanwhile; it has been once this ends."""
-    with ThreadPoolExecutor(1) as thread:
-        written = thread.submit(write)
-        yield
-    written.result()
 
 
 def _head_of(fd: int) -> npt.NDArray[np.uint8]:

@@ -345,6 +345,8 @@ class MapperService:
                 epoch=self._link.epoch,
             )
         )
+        if self._writer is not None:
+            self._writer.make_ready()  # the tracker is at work now
         return 0.0
 
     def _open_ring(self) -> FrameRingReader:

@@ -10,8 +10,8 @@ from vtslam.common.section import Section
 
 def mean_depth_m(frame: Frame) -> float:
     """Mean of the valid depths in metres; 0 if there are none."""
-    valid = frame.depth[frame.depth > 0]
-    return float(valid.mean(dtype=np.float64)) * frame.depth_scale_m if valid.size else 0.0
+    valid = np.count_nonzero(frame.depth)
+    return int(frame.depth.sum(dtype=np.uint64)) / valid * frame.depth_scale_m if valid else 0.0
 
 
 def near_and_valid(

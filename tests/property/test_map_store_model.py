@@ -59,6 +59,12 @@ class StoreModel(RuleBasedStateMachine):
 
     @precondition(lambda self: self.writer is not None)
     @rule()
+    def make_ready(self) -> None:
+        assert self.writer is not None
+        self.writer.make_ready()
+
+    @precondition(lambda self: self.writer is not None)
+    @rule()
     def take_over(self) -> None:
         former, self.writer = self.writer, self.store.adopt_active()
         assert former is not None

@@ -3,11 +3,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.shm_sections import SmallSection, frame_bytes, frame_of, sealed_section, section_bytes, spec_of
+from helpers.shm_sections import MAX_FRAMES, SmallSection, frame_bytes, frame_of, sealed_section, section_bytes, spec_of
 
 from vtslam.common.shm.errors import (
     DamagedBlock,
     GenerationGone,
+    MapStoreFull,
     NoFreePin,
     SectionNotResident,
     SectionPinned,
@@ -116,6 +117,44 @@ def test_buffers_are_given_back(store: MapStore) -> None:
         pin.release()
     writer.commit(small.commit(5))
     assert len(list(folder.glob("learned-*"))) == 2
+
+
+def test_what_the_next_commit_takes_is_reserved_before(store: MapStore) -> None:
+    few = replace(_SMALL, rows=0)
+    writer = store.create_active(spec_of(1))
+    for frames in (1, 2, 3):  # until both files of moments and the spare buffer are there
+        writer.commit(few.commit(frames))
+    ready = []
+    for frames in (4, 5):
+        writer.make_ready()
+        ready.append(store.used_bytes())
+        writer.make_ready()
+        assert store.used_bytes() == ready[-1]
+        writer.commit(few.commit(frames))
+        assert store.used_bytes() == ready[-1]
+    assert ready[1] > ready[0]
+
+
+def test_room_that_is_not_there_is_for_the_commit_to_miss(tmp_path: Path) -> None:
+    store = MapStore(tmp_path / "map", budget_bytes=1 << 26, pins=3)
+    writer = store.create_active(spec_of(1))
+    writer.commit(_SMALL.commit(1))
+    used = store.budget_bytes = store.used_bytes()
+    writer.make_ready()
+    assert store.used_bytes() == used
+    with pytest.raises(MapStoreFull):
+        writer.commit(_SMALL.commit(2))
+    store.budget_bytes = 1 << 26
+    assert writer.commit(_SMALL.commit(2)) == 2
+
+
+def test_no_image_is_reserved_beyond_the_last(store: MapStore) -> None:
+    writer = store.create_active(spec_of(1))
+    for frames in range(1, MAX_FRAMES + 1):
+        writer.commit(_SMALL.commit(frames))
+    used = store.used_bytes()
+    writer.make_ready()
+    assert store.used_bytes() == used
 
 
 def test_only_verified_and_unpinned_sections_leave(store: MapStore) -> None:
