@@ -249,7 +249,15 @@ def test_what_was_done_before_a_stop_is_kept_and_its_short_section_mapped_again(
 ) -> None:
     late = small.files.color_path(SECTION + 2)
     with read_once_told(late) as may_be_read:
-        calm = Disturbance(on_step=lambda: may_be_read.set() if calm.frames > SECTION else None)
+        steps_with_enough: list[int] = []
+
+        def on_step() -> None:
+            if calm.frames > SECTION:
+                steps_with_enough.append(calm.frames)
+            if len(steps_with_enough) > 1:  # in the first one the stop was asked for, in the second one told
+                may_be_read.set()
+
+        calm = Disturbance(on_step=on_step)
         summary = fleet_run(small.files, tmp_path / "run", calm, should_stop=lambda: calm.frames > SECTION)
 
     assert summary.interrupted
