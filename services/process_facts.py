@@ -5,8 +5,6 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-_STATUS = Path("/proc/self/status")
-
 
 def program_version() -> str:
     """Version of vtslam, or "unknown" where it runs from a source tree that is not installed."""
@@ -37,13 +35,13 @@ def peak_rss_mb() -> float:
 
     From the kernel's VmHWM: getrusage would also count what the process was before it became this program.
     """
-    return _status_mb(_STATUS, "VmHWM:")
+    return _status_mb("self", "VmHWM:")
 
 
 def private_rss_mb(pid: int) -> float:
     """Memory of a process that is no file's and nobody else's (RssAnon), in 10^6 bytes; 0 if there is no such one."""
     try:
-        return _status_mb(Path(f"/proc/{pid}/status"), "RssAnon:")
+        return _status_mb(str(pid), "RssAnon:")
     except OSError:
         return 0.0
 
@@ -51,17 +49,23 @@ def private_rss_mb(pid: int) -> float:
 def cpu_seconds(pid: int) -> float:
     """Processor time that a process has used with all its threads; 0 if there is no such one."""
     try:
-        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()  # the name before it may hold anything
+        words = _said(f"/proc/{pid}/stat").rpartition(")")[2].split()  # the name before it may hold anything
     except OSError:
         return 0.0
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _status_mb(path: Path, key: str) -> float:
-    for line in path.read_text(encoding="ascii", errors="replace").splitlines():
+def _status_mb(process: str, key: str) -> float:
+    for line in _said(f"/proc/{process}/status").splitlines():
         if line.startswith(key):
             return int(line.split()[1]) * 1024 / 1e6
     return 0.0
+
+
+def _said(path: str) -> str:
+    """A file's text; a Path would leave marks in the memory that is looked at (see `MapStore.used_bytes`)."""
+    with open(path, encoding="ascii", errors="replace") as file:
+        return file.read()
 
 
 def is_gone(pid: int) -> bool:

@@ -127,7 +127,7 @@ def column(area: npt.NDArray[np.uint8], offset: int, dtype: npt.DTypeLike, shape
     return area[offset : offset + length].view(kind).reshape(shape)
 
 
-def used_bytes(path: Path) -> int:
+def used_bytes(path: Path | str) -> int:
     """Bytes reserved by a file; 0 if it is gone."""
     try:
         return os.lstat(path).st_blocks * 512

@@ -71,8 +71,10 @@ class MapStore:
     def used_bytes(self) -> int:
         """Bytes reserved by all blocks."""
         total = sum(self.sealed_bytes().values())
+        # Texts, no Paths: this is asked many times a second. pathlib enters each part in the interpreter's table of
+        # texts, and a table that so many were entered in and removed from is at some time made anew, megabytes larger.
         for folder, _, names in os.walk(self._folder):
-            total += sum(used_bytes(Path(folder, name)) for name in names if not name.startswith("sealed-"))
+            total += sum(used_bytes(f"{folder}/{name}") for name in names if not name.startswith("sealed-"))
         return total
 
     def sealed_bytes(self) -> dict[int, int]:
