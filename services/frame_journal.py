@@ -51,7 +51,7 @@ class JournalWriter:
         except OSError as error:
             os.ftruncate(descriptor, start)
             os.lseek(descriptor, start, os.SEEK_SET)
-            raise refusal_of(Path(_path(self._folder, section_id)), error, len(data)) from error
+            raise refusal_of(self._folder / _name(section_id), error, len(data)) from error
 
     def close(self) -> None:
         """Give the descriptor back."""
@@ -62,7 +62,7 @@ class JournalWriter:
     def _descriptor(self, section_id: int) -> int:
         if self._file is None or self._file[0] != section_id:
             self.close()
-            self._file = section_id, _open_at_last_line(Path(_path(self._folder, section_id)))
+            self._file = section_id, _open_at_last_line(self._folder / _name(section_id))
         return self._file[1]
 
 
@@ -93,7 +93,7 @@ class JournalReader:
         """Delete the lines of sections before this one, which are durable."""
         for found in self._sections():
             if found < section_id:
-                Path(_path(self._folder, found)).unlink(missing_ok=True)
+                (self._folder / _name(found)).unlink(missing_ok=True)
         self.skip_before(section_id)
 
     def skip_before(self, section_id: int) -> None:
@@ -112,7 +112,7 @@ class JournalReader:
 
     def _new_lines_here(self) -> Iterator[JournalLine]:
         try:
-            with open(_path(self._folder, self._section_id), "rb") as file:
+            with open(f"{self._folder}/{_name(self._section_id)}", "rb") as file:  # often too
                 file.seek(self._offset)
                 data = file.read()
         except FileNotFoundError:
@@ -123,8 +123,8 @@ class JournalReader:
             yield found
 
 
-def _path(folder: Path, section_id: int) -> str:
-    return f"{folder}/{section_id:06d}"
+def _name(section_id: int) -> str:
+    return f"{section_id:06d}"
 
 
 def _open_at_last_line(path: Path) -> int:
